@@ -492,20 +492,20 @@ def explanation(error: ModuleNotFoundError) -> str | None:
     extra = "ros" if is_ros else EXTRAS.get(module)
     if not extra:
         return None
-    ways = []
+    commands = []
     if is_ros:
-        ways.append("source a ROS 2 installation")
+        commands.append("source a ROS 2 installation")
     elif os.environ.get("ROS_DISTRO"):
         # beside a ROS installation, of a workspace there
         in_ubuntu = module in _APT
         apt = f"apt install python3-{module}"
         pip = f"pip install {_PIP.get(module, module)}"
-        ways.append(apt if in_ubuntu else pip)
-    ways.append(
+        commands.append(apt if in_ubuntu else pip)
+    commands.append(
         f"pip install 'sst_ros[{extra}]' (in the source folder: pip install"
         f" '.[{extra}]')"
     )
-    return f"{module} is not installed: {', or '.join(ways)}"
+    return f"{module} is not installed: {', or '.join(commands)}"
 
 
 def explain_missing_ros(packages: Sequence[str]) -> str:

@@ -26,7 +26,7 @@ from sst_ros.description.robot import (
     ACTUATED_LINKS,
     BASE,
     INTERMEDIATE,
-    LEGS,
+    LEG_NUMBERS,
     STAR_LINK,
 )
 from sst_ros.errors import SstError
@@ -112,7 +112,7 @@ def _add_frames(server: PageServer, scene: Scene, size: float) -> None:
     end = np.array([0.0, 0.0, star])
     bar = 1.04 * (base + 1.5 * thick) * np.array([np.cos(_ALONG), 0.0, np.sin(_ALONG)])
     places = {BASE: ("{B}", np.zeros(3), 0.42), STAR_LINK: ("{E}", 1.05 * end, 0.24)}
-    for k in LEGS:
+    for k in LEG_NUMBERS:
         places[ACTUATED_LINKS[k - 1]] = (f"{{1{k}}}", bar, 0.15)
         places[INTERMEDIATE[k - 1]] = (
             f"{{2{k}}}",

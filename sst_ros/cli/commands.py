@@ -78,12 +78,12 @@ def _number_of(convert: Callable[[str], Any], text: str) -> Any:
 _flag = partial(Arg, action="store_true")
 _path = partial(Arg, type=Path)
 _number = partial(Arg, type=partial(_number_of, float))
-_whole = partial(Arg, type=partial(_number_of, int))
+_whole_number = partial(Arg, type=partial(_number_of, int))
 # which shells complete by argcomplete
 _scene = partial(Arg, completer="scene.scene:names")
 
 
-def _out(description: str, default: str) -> tuple[Arg, Arg]:
+def _output_options(description: str, default: str) -> tuple[Arg, Arg]:
     """Describe `--out` and `--force`, which `free_out` obeys."""
     force = _flag("--force", "overwrite earlier results in --out")
     return _path("--out", f"{description}; default: {default}"), force
@@ -94,13 +94,13 @@ def _count(
 ) -> Arg:
     """Describe an option that is a whole number in a range."""
 
-    def whole(text: str) -> int:
+    def read_count(text: str) -> int:
         if text.isascii() and text.isdecimal() and least <= int(text) <= most:
             return int(text)
         requirement = f"must be a whole number from {least} to {most}, not {text!r}"
         raise argparse.ArgumentTypeError(requirement)
 
-    return Arg(name, description, type=whole, metavar="N", **options)
+    return Arg(name, description, type=read_count, metavar="N", **options)
 
 
 _INTEGRATORS = ("auto", "rk4", "dopri5", "dop853", "rodas5p")
@@ -184,7 +184,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         "map the workspace of a scene: reach, condition, singular poses",
         "cli.runs:map_workspace",
         SCENE_ARGUMENT,
-        *_out("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
+        *_output_options("picture, .png, .pdf or .svg", "SCENE_workspace.png"),
     ),
     "zone": Subcommand(
         "prove a part of the workspace: regular and inside all limits, with tolerances",
@@ -276,7 +276,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
             metavar="KEY",
         ),
         Arg("--outputs", "equations; default: all", nargs="+", metavar="NAME"),
-        *_out("folder of the files", "SCENE_TARGET"),
+        *_output_options("folder of the files", "SCENE_TARGET"),
     ),
     "demo": Subcommand(
         "run the paper's examples or a reference motion by the nodes",
@@ -284,7 +284,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         Arg(
             "kind", "default: examples", nargs="?", choices=("examples", "feedforward")
         ),
-        *_out("folder of the results", "demo_out or demo_out/feedforward"),
+        *_output_options("folder of the results", "demo_out or demo_out/feedforward"),
         _scene("--scene", "with feedforward: name of a scene, or path of a .yaml file"),
         Arg("--mode", "with feedforward: control modes", nargs="+", choices=_MODES),
         needs="rclpy rosbags matplotlib",
@@ -318,7 +318,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         "evaluate a recorded run",
         "cli.reports:report_run",
         BAG,
-        *_out("folder of the results", "BAG_report, beside the bag"),
+        *_output_options("folder of the results", "BAG_report, beside the bag"),
         _NAMESPACE_ARGUMENT,
         _flag("--verbose", "print all figures"),
         _flag("--damaged", "evaluate the intact part of a damaged recording"),
@@ -327,7 +327,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         "work-precision diagrams: error against cost of every method and step",
         "cli.reports:report_accuracy",
         _scene("scenes", f"{_OF_SCENE}; default: all", nargs="*", metavar="SCENE"),
-        *_out("folder of the results", "accuracy_out"),
+        *_output_options("folder of the results", "accuracy_out"),
     ),
     "report stability": Subcommand(
         "stable steps along the motion of a scene; runs at its limits and with other"
@@ -341,14 +341,14 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
             default=[],
             metavar="ROW",
         ),
-        *_out("folder of the results", "stability_out"),
+        *_output_options("folder of the results", "stability_out"),
         needs="pandas matplotlib",
     ),
     "plot": Subcommand(
         "draw a recorded run, as PDF and PNG",
         "cli.reports:draw_pictures",
         _path("bag", "folder of the bag", nargs="?", metavar="BAG"),
-        *_out("folder of the pictures", "BAG_plots, beside the bag"),
+        *_output_options("folder of the pictures", "BAG_plots, beside the bag"),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _NAMESPACE_ARGUMENT,
         _flag("--list", "list the pictures, and draw none"),
@@ -376,7 +376,9 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
             default=[],
             metavar="NS",
         ),
-        *_out("folder of the pictures", "BAG_compared, beside the first bag"),
+        *_output_options(
+            "folder of the pictures", "BAG_compared, beside the first bag"
+        ),
         Arg("--only", "draw only these", nargs="+", default=[], metavar="NAME"),
         _path("--csv", "write the table, with all digits", metavar="FILE"),
     ),
@@ -386,7 +388,7 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
         BAG,
         _NAMESPACE_ARGUMENT,
         Arg("--format", "default: csv", choices=("csv", "parquet"), default="csv"),
-        *_out("folder of the tables", "BAG_tables, beside the bag"),
+        *_output_options("folder of the tables", "BAG_tables, beside the bag"),
     ),
     "recover": Subcommand(
         "write a valid recording from a truncated or damaged one",
@@ -449,8 +451,8 @@ SUBCOMMANDS: dict[str, Subcommand | str] = {
             "of measured angles [s]; default: estimated where angles are filtered",
         ),
         _number("--duration", "of a designed motion [s]; default: 6"),
-        _whole("--harmonics", "of a designed motion; default: 5"),
-        _whole("--seed", "of a designed motion; default: 0"),
+        _whole_number("--harmonics", "of a designed motion; default: 5"),
+        _whole_number("--seed", "of a designed motion; default: 0"),
         _path("--out", "write the scene", metavar="SCENE.yaml"),
         _flag("--force", "overwrite the file of --out"),
         details=(

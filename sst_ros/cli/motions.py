@@ -156,13 +156,13 @@ def run_identification(options: argparse.Namespace) -> None:
         options.bag == DESIGN,
         "must be given after design, and only there",
     )
-    ours, others = (
+    ours, foreign_options = (
         ("duration", "harmonics", "seed"),
         ("cutoff", "delay", "scene", "method", "namespace"),
     )
     chosen, foreign = (
         {name: value for name in names if (value := getattr(options, name)) is not None}
-        for names in ((ours, others) if designing else (others, ours))
+        for names in ((ours, foreign_options) if designing else (foreign_options, ours))
     )
     absent = f"is no option of identify {DESIGN if designing else 'BAG'}"
     refuse_unless(

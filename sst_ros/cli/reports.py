@@ -112,19 +112,19 @@ def run_demo(options: argparse.Namespace) -> None:
     following = options.kind == "feedforward"
     if not following and (options.scene or options.mode):
         options.parser.error("--scene and --mode are options of `demo feedforward`")
-    out = free_out(options, "demo_out/feedforward" if following else "demo_out")
+    target = free_out(options, "demo_out/feedforward" if following else "demo_out")
     if following:
         name = options.scene or demo.FOLLOWED
         for mode in options.mode or demo.DEMO_MODES:
             print(f"{name}, {mode}: {load(name).description}", flush=True)
-            bag = demo.follow(name, out / mode, mode)
+            bag = demo.follow(name, target / mode, mode)
             print(
-                function("report.tracking:write_tracking_report")(bag, out / mode),
+                function("report.tracking:write_tracking_report")(bag, target / mode),
                 flush=True,
             )
         return
     for name in demo.EXAMPLES:
-        folder = out if name == "example2" else out / name  # the main job
+        folder = target if name == "example2" else target / name  # the main job
         print(f"{name}: {load(name).description}", flush=True)
         bag = demo.record(name, folder)
         summary = function("report.run_page:write_run_report")(bag, folder)

@@ -300,9 +300,10 @@ def _controller(scene: Scene, options: argparse.Namespace, period: float) -> obj
 def view(options: argparse.Namespace) -> int:
     """Serve the page of a bag, of a running simulator, or of one started for it."""
     if options.bag is not None:
-        one = options.scene is None
+        single_scene = options.scene is None
         refuse_unless(
-            "view", ("--scene", options.scene, one, "give a bag or a scene, not both")
+            "view",
+            ("--scene", options.scene, single_scene, "give a bag or a scene, not both"),
         )
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler)

@@ -67,24 +67,24 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
     A RuntimeWarning says that there is no C compiler, and so no binary in it.
     """
     name = identifier(equations)
-    scene = SceneEquations(
+    model = SceneEquations(
         equations.scene, equations.parameters, ("derivative", "joints", "energies")
     )
     templates = load_templates("code_generation")
     token = str(
         uuid.uuid5(
             uuid.NAMESPACE_URL,
-            f"{VERSION} {scene.scene_hash} {scene.parameters}",
+            f"{VERSION} {model.scene_hash} {model.parameters}",
         )
     )
-    sources = c_files(scene)
+    sources = c_files(model)
     sources["fmi3.c"] = templates.get_template("fmi3.c").render(
         name=name,
         token=token,
-        states=scene.state.size,
-        inputs=sum(argument.size for argument in scene.acting),
-        parameters=scene.parameters,
-        torque_limit=scene.scene.torque_limit,
+        states=model.state.size,
+        inputs=sum(argument.size for argument in model.acting),
+        parameters=model.parameters,
+        torque_limit=model.scene.torque_limit,
         stages=len(DOP853.c),
         stage_rows=[[*row, *(0.0,) * (len(DOP853.c) - len(row))] for row in DOP853.a],
         weights=DOP853.b,
@@ -93,16 +93,16 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
     )
     description = templates.get_template("modelDescription.xml").render(
         name=name,
-        title=scene.scene.name,
+        title=model.scene.name,
         token=token,
         description=(
-            f"{scene.scene.description} SHA-256 of the scene: {scene.scene_hash}"
+            f"{model.scene.description} SHA-256 of the scene: {model.scene_hash}"
         ),
         version=VERSION,
         units=FMU_UNITS,
-        duration=scene.scene.duration,
-        variables=[*_variables(scene)],
-        structure=[*_structure(scene)],
+        duration=model.scene.duration,
+        variables=[*_variables(model)],
+        structure=[*_structure(model)],
     )
     build = templates.get_template("buildDescription.xml").render(name=name)
     files: dict[str, str | bytes] = {"modelDescription.xml": description}
@@ -195,9 +195,9 @@ def _binary(name: str, sources: dict[str, str]) -> dict[str, bytes]:
             command, cwd=place, capture_output=True, text=True, check=False
         )
         if compilation.returncode != 0:
-            errors = compilation.stderr.strip().splitlines()
-            reason = errors[0] if errors else compilation.returncode
-            raise SstError(f"the C compiler cc failed: {reason}")
+            error_lines = compilation.stderr.strip().splitlines()
+            failure = error_lines[0] if error_lines else compilation.returncode
+            raise SstError(f"the C compiler cc failed: {failure}")
         return {
             f"binaries/{folder}/{name}.so": (Path(place) / f"{name}.so").read_bytes()
         }

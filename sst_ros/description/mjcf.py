@@ -25,7 +25,7 @@ from sst_ros.description.robot import (
     BASE,
     INTERMEDIATE,
     LEAST_MASS,
-    LEGS,
+    LEG_NUMBERS,
     STAR_LINK,
     STARS,
     Body,
@@ -121,7 +121,7 @@ def _sites(scene: Scene, geometry: Geometry) -> dict[str, list[tuple[str, Array]
     radius = scene.star.radius
     end = np.array([0.0, 0.0, radius])
     sites: dict[str, list[tuple[str, Array]]] = {STAR_LINK: []}
-    for leg in LEGS[1:]:
+    for leg in LEG_NUMBERS[1:]:
         along = radius * geometry.e[leg - 1]
         sites[STAR_LINK] += [
             (f"{STAR_LINK}_e{leg}", along),

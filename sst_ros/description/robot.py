@@ -43,7 +43,7 @@ from sst_ros.state import BASE_FRAME, Vector3
 BASE = BASE_FRAME
 STAR_LINK = "star"
 PAYLOAD = "payload"
-LEGS = (1, 2, 3)
+LEG_NUMBERS = (1, 2, 3)
 STARS = (STAR_LINK, "star_from_2", "star_from_3")  # {E} as seen from legs 1, 2 and 3
 ACTUATED_LINKS = ("actuated_1", "actuated_2", "actuated_3")
 """Links with the frames {1k} = [r, w x r, w] of the legs."""
@@ -114,7 +114,7 @@ def joints_of(geometry: Geometry) -> list[Joint]:
     """Return all nine joints, parents before children; signs as in Eqs. 50 to 52."""
     z = np.array([0.0, 0.0, 1.0])
     joints = []
-    for k, leg in enumerate(LEGS):
+    for k, leg in enumerate(LEG_NUMBERS):
         v = geometry.v[k]
         w = geometry.w[k]
         e = geometry.e[k]
@@ -433,7 +433,7 @@ def bodies_of(scene: Scene) -> Iterator[Body]:
         tensor = np.zeros((3, 3)) if payload.inertia is None else payload.inertia.matrix
         yield Body(PAYLOAD, STAR_LINK, payload.mass, np.array(payload.centre), tensor)
     motor = scene.actuators
-    for k, leg in enumerate(LEGS):
+    for k, leg in enumerate(LEG_NUMBERS):
         for name, link, radius in (
             (ACTUATED_LINKS[k], scene.actuated_links[k], scene.base.radius),
             (INTERMEDIATE[k], scene.intermediate_links[k], star.radius),

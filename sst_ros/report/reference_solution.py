@@ -90,17 +90,17 @@ class InitialValueProblem:
         self.clamped = scene.torque_limit is not None and largest > scene.torque_limit
         self.kinked = self.clamped or scene.stroke.at_end == "elastic"
         motion = simulate(scene, duration=scene.duration or WHOLE_RUN_S)
-        whole, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
+        end_time, reason = float(motion.t[-1]), motion.message.partition(": ")[2]
         # before the duration
-        self.ends = f"stop at {whole:.6f} s, {reason}" if reason else ""
-        lasts = whole * NANOSECONDS >= 1000 * INTERVALS
+        self.ends = f"stop at {end_time:.6f} s, {reason}" if reason else ""
+        lasts = end_time * NANOSECONDS >= 1000 * INTERVALS
         requirement = (
-            f"the run is over before it can be studied: {self.ends or f'{whole} s'}"
+            f"the run is over before it can be studied: {self.ends or f'{end_time} s'}"
         )
-        refuse_unless(scene.name, ("initial", whole, lasts, requirement))
+        refuse_unless(scene.name, ("initial", end_time, lasts, requirement))
         # Instants of comparison lie 1, 2 or 5 times a power of ten apart.
         # may be a little less than it is called
-        whole_ns = whole * NANOSECONDS * (1.0 + 1e-9)
+        whole_ns = end_time * NANOSECONDS * (1.0 + 1e-9)
         lengths = (f * 10**n for n in range(18) for f in (1, 2, 5))
         self.interval_ns = interval_ns or max(
             x for x in lengths if x * INTERVALS <= whole_ns

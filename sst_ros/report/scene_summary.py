@@ -32,7 +32,7 @@ from sst_ros.scene.schema import build, drop_idle
 from sst_ros.scene.yaml_document import replace_values
 from sst_ros.simulation.simulate import simulate
 
-WIDTH = 100
+COLUMNS = 100
 
 
 def summary(scene: Scene) -> str:
@@ -51,7 +51,7 @@ def summary(scene: Scene) -> str:
         limits=len(list(limits_of(scene, geometry))),
         advice=step_advice(scene).text,
         wrap=lambda text, first: textwrap.fill(
-            text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first),
+            text, COLUMNS, initial_indent=first, subsequent_indent=" " * len(first),
             break_on_hyphens=False,
         ),
     )  # fmt: skip

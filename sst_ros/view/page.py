@@ -415,9 +415,13 @@ class SceneDrawing:
         """
         shaft, head, length = (self._size * size for size in sizes)
         linear = np.asarray(colour, dtype=float) ** 2.2
-        given: Any = {"shaft_radius": shaft, "head_radius": head, "head_length": length}
+        arrow_sizes: Any = {
+            "shaft_radius": shaft,
+            "head_radius": head,
+            "head_length": length,
+        }
         return self._server.scene.add_arrows(
-            f"{ROOT}/{name}", ends[None], linear, **given
+            f"{ROOT}/{name}", ends[None], linear, **arrow_sizes
         )
 
     def _add_labels(self) -> None:

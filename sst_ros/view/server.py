@@ -173,8 +173,8 @@ def _free_port(host: str, port: int) -> int:
     """
     requirement = f"must be between {_PORTS[0]} and {_PORTS[1]}"
     refuse_unless("view", ("port", port, _PORTS[0] <= port <= _PORTS[1], requirement))
-    known = "host", host, "must be an address of this machine"
-    with refuse_errors("view", *known, OSError, ValueError):
+    host_check = "host", host, "must be an address of this machine"
+    with refuse_errors("view", *host_check, OSError, ValueError):
         # An empty name would be every address: getaddrinfo knows none of it.
         addresses = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
         _listen(addresses, 0)

@@ -91,20 +91,20 @@ class Replay:
         self.scene, self._seconds = self._run.scene, self._run.seconds
         self.length = float(self._seconds[-1])
         self._lock = threading.Lock()
-        self._now, self._since, self._factor = 0.0, time.monotonic(), 1.0
-        self.playing, self._shown = True, -1
+        self._time, self._since, self._factor = 0.0, time.monotonic(), 1.0
+        self.playing, self._sent = True, -1
 
     def play(self, playing: bool) -> None:
         """Play or pause; play from the beginning at the end."""
         with self._advance():
-            if playing and self._now >= self.length:
-                self._now = 0.0
+            if playing and self._time >= self.length:
+                self._time = 0.0
             self.playing = playing
 
     def seek(self, time: float) -> None:
         """Go to a time [s]."""
         with self._advance():
-            self._now = min(max(time, 0.0), self.length)
+            self._time = min(max(time, 0.0), self.length)
 
     def set_speed(self, factor: float) -> None:
         """Set recorded time per time."""
@@ -114,10 +114,10 @@ class Replay:
     def states(self) -> Sequence[ViewState]:
         """Return the states up to now, from the beginning after a jump back."""
         with self._advance():
-            time = self._now
+            time = self._time
         row = max(int(np.searchsorted(self._seconds, time + 1e-9, side="right")) - 1, 0)
-        first = self._shown + 1 if row >= self._shown else 0
-        self._shown = row
+        first = self._sent + 1 if row >= self._sent else 0
+        self._sent = row
         run, rows = self._run, slice(first, row + 1)
         columns = (run.gamma, run.mu, run.beta, run.gamma_dot, run.effort)
         series = zip(
@@ -140,10 +140,10 @@ class Replay:
         with self._lock:
             clock = time.monotonic()
             if self.playing:
-                self._now = min(
-                    self._now + (clock - self._since) * self._factor, self.length
+                self._time = min(
+                    self._time + (clock - self._since) * self._factor, self.length
                 )
-                self.playing = self._now < self.length
+                self.playing = self._time < self.length
             self._since = clock
             yield
 

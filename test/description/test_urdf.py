@@ -24,7 +24,7 @@ from sst_ros.description.robot import (
     BASE,
     INTERMEDIATE,
     LEAST_MASS,
-    LEGS,
+    LEG_NUMBERS,
     PLUGIN,
     STAR_LINK,
     STARS,
@@ -112,7 +112,7 @@ def test_inertias_of_every_scene(name):
     about_o = {joint: inertia.matrix()[3:, 3:] for joint, inertia in found.items()}
     bodies = virtual_work.Mechanism.of(scene)
     expected = {"beta_1": bodies.star}
-    for k, leg in enumerate(LEGS):
+    for k, leg in enumerate(LEG_NUMBERS):
         expected[f"gamma_{leg}"] = bodies.actuated[k]
         expected[f"mu_{leg}"] = bodies.intermediate[k]
     scale = np.abs(bodies.star).max()
@@ -183,7 +183,7 @@ def acceleration(scene, angles, motion, torque, moment=(0.0, 0.0, 0.0)):
     rate_of = by_joint(motion.gamma_dot, motion.mu_dot, motion.beta_dot)
     for name in open_joints:
         v[model.joints[model.getJointId(name)].idx_v] = rate_of[name]
-    for k, leg in enumerate(LEGS):
+    for k, leg in enumerate(LEG_NUMBERS):
         u[model.joints[model.getJointId(f"gamma_{leg}")].idx_v] = torque[k]
     pin.computeJointJacobians(model, read.data, q)
     in_base = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -233,7 +233,7 @@ def test_motion_under_gravity_with_payload_and_rotors():
     motion = rates.of_actuators(at, gamma_dot)
     angles = angles_of(geometry, gamma, at.rotation)
     for spring in scene.springs:  # URDF has none
-        torque[LEGS.index(int(spring.joint[-1]))] -= spring.stiffness * (
+        torque[LEG_NUMBERS.index(int(spring.joint[-1]))] -= spring.stiffness * (
             angles[spring.joint] - spring.rest
         )
     found = acceleration(scene, angles, motion, torque)

@@ -23,7 +23,7 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.mechanism.geometry import quaternion_of
 from sst_ros.report import accuracy
 from sst_ros.report.scene_summary import (
-    WIDTH,
+    COLUMNS,
     costs,
     eigenvalues,
     largest_stable_step,
@@ -113,7 +113,7 @@ def test_a_summary_has_all_parts_and_each_term_adds_or_folds(name):
     for key, reason in scene.provenance:
         assert re.search(rf"^  {key} +{re.escape(reason[:20])}", said, re.MULTILINE)
     assert step_advice(scene).text in " ".join(said.split())
-    assert max(map(len, said.splitlines()[1:])) <= WIDTH
+    assert max(map(len, said.splitlines()[1:])) <= COLUMNS
 
 
 @pytest.mark.parametrize(
