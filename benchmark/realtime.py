@@ -295,7 +295,7 @@ def _measure(
         seconds = min(60.0 * options.minutes, 60.0) or 20.0
         found = fleet(watch, number, options.rate, seconds, given)
         yield show("fleet", format_columns([{"": "fleet", **found}]))
-    packages = ("rclpy", "numba", "numpy", "ros-rclpy", "ros-rmw-fastrtps-cpp")
+    packages = ("rclpy", "llvmlite", "numpy", "ros-rclpy", "ros-rmw-fastrtps-cpp")
     said = f"Scene {options.scene}. {join_line(describe_machine(*packages))}."
     print(said, flush=True)
     yield "machine", said
