@@ -215,25 +215,24 @@ class Client:
         self, kind: Any, name: str, timeout: float = 10.0, **fields: Any
     ) -> tuple[Any, float]:
         """Call a service; return the reply, or None, and how long it took [s]."""
-        client = self.client(kind, name)
-        if client is None:
+        if not self.knows(name):
+            self._clients[name] = self.node.create_client(
+                kind, name, qos_profile=self.qos
+            )
+        client = self._clients[name]
+        if not self.until(client.service_is_ready, _DISCOVERY_S):
             return None, math.inf
         future, began = client.call_async(kind.Request(**fields)), time.monotonic()
         done = self.until(future.done, timeout)
         return (future.result() if done else None), time.monotonic() - began
 
-    def client(self, kind: Any, name: str) -> Any:
-        """Return a client whose service is ready, or None.
+    def knows(self, service: str) -> bool:
+        """Return whether a client of this service is there, from an earlier call.
 
-        It stays: a server may answer before it has discovered who receives its replies,
-        and each new client would run that race again.
+        Clients stay: a server may answer before it has discovered who receives its
+        replies, and each new client would run that race again.
         """
-        if name not in self._clients:
-            self._clients[name] = self.node.create_client(
-                kind, name, qos_profile=self.qos
-            )
-        client = self._clients[name]
-        return client if self.until(client.service_is_ready, _DISCOVERY_S) else None
+        return service in self._clients
 
 
 class Account:

@@ -209,18 +209,16 @@ def test_the_parser_of_bloom_reads_every_release():
         for version, date, content in changelog.foreach_version()
     }
     assert list(read)[::-1] == re.findall(r"^## \[(\d\S+)\] - ", MARKDOWN, re.M)
-    date, content = read[sst_ros.__version__]
-    assert f"## [{sst_ros.__version__}] - {date.date()}" in MARKDOWN
-    released = MARKDOWN.partition(f"## [{sst_ros.__version__}]")[2].partition("\n## ")[
-        0
-    ]
-    items = [
-        item
-        for bullets in content
-        if hasattr(bullets, "bullets")
-        for item in bullets.bullets
-    ]
-    assert len(items) == len(re.findall(r"^- ", released, re.M)) > 10
+    assert sst_ros.__version__ in read
+    total = 0
+    for version, (date, content) in read.items():
+        head = f"## [{version}] - {date.date()}"
+        released = MARKDOWN.partition(head)[2].partition("\n## ")[0]
+        bullets = [one.bullets for one in content if hasattr(one, "bullets")]
+        items = sum(map(len, bullets))
+        assert items == len(re.findall(r"^- ", released, re.M))
+        total += items
+    assert total > 10  # the section of a release that is tried may be empty
 
 
 def test_the_changelog_is_restructured_text():

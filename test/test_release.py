@@ -11,12 +11,14 @@ import runpy
 import shutil
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import pytest
 import yaml
 
 import sst_ros
+from tools import changelog_rst, metadata
 
 tomllib = importlib.import_module(
     "tomllib" if sys.version_info >= (3, 11) else "pip._vendor.tomli"
@@ -60,7 +62,7 @@ def test_the_page_of_the_release_in_a_clone(tmp_path):
     )
     shutil.copytree(ROOT, source, ignore=ignored)
     commands = [line.strip() for step in STEPS for line in step.splitlines()]
-    assert len(commands) == 30 and sum(not dry(command) for command in commands) == 8
+    assert len(commands) == 28 and sum(not dry(command) for command in commands) == 8
     git = [
         "git init --quiet",
         "git add --all",
@@ -85,16 +87,44 @@ def test_the_page_of_the_release_in_a_clone(tmp_path):
     tags = subprocess.run(
         ["git", "tag"], cwd=source, capture_output=True, text=True
     ).stdout
-    assert tags == "v0.2.0\n"
+    version = metadata.next_version()
+    assert tags == f"v{version}\n"
     assert {path.name for path in (source / "dist").iterdir()} == {
-        "sst_ros-0.2.0-py3-none-any.whl", "sst_ros-0.2.0.tar.gz",
+        f"sst_ros-{version}-py3-none-any.whl", f"sst_ros-{version}.tar.gz",
     }  # fmt: skip
     hardware = (tmp_path / "sst_ros_hardware", "tag")
     tags = subprocess.run(
         ["git", "-C", *hardware], capture_output=True, text=True
     ).stdout
-    assert tags == "0.2.0\n"
-    assert "\n0.2.0 (20" in (source / "CHANGELOG.rst").read_text(encoding="utf-8")
+    assert tags == f"{version}\n"
+    for changelog in (source / "CHANGELOG.rst", hardware[0] / "CHANGELOG.rst"):
+        assert f"\n{version} (20" in changelog.read_text(encoding="utf-8")
+
+
+def test_the_next_version_is_the_next_minor_one(capsys, monkeypatch):
+    monkeypatch.setattr(metadata, "version", lambda: "1.9.3")
+    monkeypatch.setattr(sys, "argv", ["metadata", "--next"])
+    assert metadata.main() == 0 and capsys.readouterr().out == "1.10.0\n"
+
+
+def test_a_changelog_of_hardware_without_news_has_its_version():
+    title = "^^^\nABC\n^^^\n\n"
+    before = f"{title}Forthcoming\n-----\n\n* News.\n"
+    day = date(2026, 11, 27)
+    once = changelog_rst.date_hardware(before, "0.2.0", day)
+    assert once == f"{title}0.2.0 (2026-11-27)\n------------------\n\n* News.\n"
+    twice = changelog_rst.date_hardware(once, "0.3.0", day)
+    head = "0.3.0 (2026-11-27)\n------------------\n\n* No changes.\n\n"
+    assert twice == title + head + once.removeprefix(title)
+
+
+def test_a_version_is_released_once():
+    markdown = "# Changelog\n\n## [Unreleased]\n\n### Added\n\n- News.\n"
+    day = date(2026, 11, 27)
+    once = changelog_rst.date_markdown(markdown, "0.2.0", day)
+    assert "## [Unreleased]\n\n## [0.2.0] - 2026-11-27\n\n### Added" in once
+    with pytest.raises(ValueError, match="none of 0"):
+        changelog_rst.date_markdown(once, "0.2.0", day)
 
 
 def test_conda_and_pixi_ask_for_what_setup_py_asks_for(monkeypatch):

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write CHANGELOG.rst from the released sections of CHANGELOG.md.
 
-bloom reads CHANGELOG.rst (REP 132).
+    python -m tools.changelog_rst
+    python -m tools.changelog_rst --release 0.2.0  # date what is unreleased first
 
-python -m tools.changelog_rst
+bloom reads CHANGELOG.rst (REP 132), and that of the package in hardware/.
 """
 
 from __future__ import annotations
 
+import argparse
 import re
+from datetime import date
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -23,8 +26,8 @@ def text(markdown: str) -> str:
     title = "Changelog for package sst_ros"
     parts = [f"{'^' * len(title)}\n{title}\n{'^' * len(title)}\n"]
     found = _RELEASE.split(markdown)
-    for version, date, body in zip(found[1::3], found[2::3], found[3::3], strict=True):
-        head = f"{version} ({date})"
+    for version, day, body in zip(found[1::3], found[2::3], found[3::3], strict=True):
+        head = f"{version} ({day})"
         body = re.split(r"^(?:## |\[)", body, maxsplit=1, flags=re.M)[0].strip()
         parts.append(f"{head}\n{'-' * len(head)}\n\n{_body(body)}\n")
     return "\n".join(parts)
@@ -39,9 +42,52 @@ def _body(markdown: str) -> str:
     )
 
 
+def date_markdown(markdown: str, version: str, day: date) -> str:
+    """Give what is unreleased a version and a date; an empty section stays above.
+
+    Raises:
+        ValueError: the version has a section, or nothing is unreleased.
+
+    """
+    head = "## [Unreleased]\n"
+    if f"## [{version}]" in markdown or head not in markdown:
+        raise ValueError(
+            f"CHANGELOG.md: must have a section Unreleased and none of {version}"
+        )
+    return markdown.replace(head, f"{head}\n## [{version}] - {day}\n", 1)
+
+
+def date_hardware(rst: str, version: str, day: date) -> str:
+    """Give the section Forthcoming a version and a date.
+
+    Where there is no such section, the version has one without changes.
+    """
+    head = f"{version} ({day})"
+    heading = f"{head}\n{'-' * len(head)}\n"
+    forthcoming = re.search(r"^Forthcoming\n-+\n", rst, re.M)
+    if forthcoming is not None:
+        return rst.replace(forthcoming[0], heading, 1)
+    title, above, below = rst.partition("^\n\n")
+    return f"{title}{above}{heading}\n* No changes.\n\n{below}"
+
+
 def main() -> None:
     """Write the file."""
-    markdown = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.changelog_rst", description=__doc__
+    )
+    parser.add_argument("--release", metavar="VERSION", help="date what is unreleased")
+    version = parser.parse_args().release
+    path = ROOT / "CHANGELOG.md"
+    markdown = path.read_text(encoding="utf-8")
+    if version is not None:
+        markdown = date_markdown(markdown, version, date.today())
+        path.write_text(markdown, encoding="utf-8")
+        hardware = ROOT / "hardware/CHANGELOG.rst"
+        dated = date_hardware(
+            hardware.read_text(encoding="utf-8"), version, date.today()
+        )
+        hardware.write_text(dated, encoding="utf-8")
     (ROOT / "CHANGELOG.rst").write_text(text(markdown), encoding="utf-8")
 
 

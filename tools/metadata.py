@@ -3,6 +3,7 @@
 
     python -m tools.metadata           # write
     python -m tools.metadata --filled  # fail while a marked element is not filled in
+    python -m tools.metadata --next    # print the next minor version
 
 setup.py reads package.xml itself.
 """
@@ -39,6 +40,12 @@ def package() -> str:
 def version() -> str:
     """Return the version of package.xml."""
     return str(ET.fromstring(package()).findtext("version"))
+
+
+def next_version() -> str:
+    """Return the minor version that follows that of package.xml."""
+    major, minor, _ = map(int, version().split("."))
+    return f"{major}.{minor + 1}.0"
 
 
 def with_version(text: str, pattern: str) -> str:
@@ -78,14 +85,21 @@ def placeholders() -> list[str]:
 
 
 def main() -> int:
-    """Write the files, or tell what is not filled in; return the exit status."""
+    """Write the files, or tell what the options ask for; return the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m tools.metadata", description=__doc__
     )
     parser.add_argument(
         "--filled", action="store_true", help="fail where package.xml has marks"
     )
-    if parser.parse_args().filled:
+    parser.add_argument(
+        "--next", action="store_true", help="print the next minor version"
+    )
+    options = parser.parse_args()
+    if options.next:
+        print(next_version())
+        return 0
+    if options.filled:
         for line in placeholders():
             print(f"package.xml: {line}: must be filled in", file=sys.stderr)
         return 1 if placeholders() else 0

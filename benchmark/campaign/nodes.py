@@ -34,6 +34,10 @@ FAULT_S, REPLY_S, CLOSE_S = 1.0, 0.5, 2.0
 """Within this time a step beyond its budget is a fault, a node answers a service, and
 it ends, its waits for a processor not counted.
 """
+FIRST_REPLY_S = REPLY_S + 3.0
+"""The first reply to a client waits for its discovery by the node, too: a participant
+of DDS announces itself every three seconds.
+"""
 LOST_S, HUNG_S = 60.0, 120.0
 """A reply that has not come by then is lost, and a node that has not ended is killed,
 however busy the machine is.
@@ -68,22 +72,40 @@ def is_alive(ledger: Ledger, process: Process, client: Client, after: str) -> bo
         said = process.end(0, 20.0)[1][-300:]
         ledger.found("tracebacks", f"the node ended after {after}: {said}")
         return False
-    reply, took = call(process, client, SetBool, f"{NODE}/pause", data=False)
-    if reply is None:
-        ledger.found("lost", f"no reply after {after}")
-    else:
-        ledger.time(took, REPLY_S, f"a reply after {after}")
+    ask(ledger, process, client, SetBool, "pause", after, data=False)
     return True
 
 
-def call(
-    process: Process, client: Client, kind: Any, name: str, **fields: Any
-) -> tuple[Any, float]:
-    """Call a service of a node; return the reply, or None, and the own time [s]."""
-    client.client(kind, name)  # with the time of its discovery, which is not the node's
+def ask(
+    ledger: Ledger,
+    process: Process,
+    client: Client,
+    kind: Any,
+    name: str,
+    after: str,
+    **fields: Any,
+) -> Any:
+    """Call a service of a node; count a reply that is lost or late; return the reply.
+
+    Args:
+        ledger: of the part.
+        process: the node.
+        client: who calls.
+        kind: of the service.
+        name: of the service below that of the node.
+        after: what the node has gone through.
+        fields: of the request.
+
+    """
+    is_first = not client.knows(f"{NODE}/{name}")
     own_time = OwnTime(process.pid, os.getpid())
-    reply, _ = client.call(kind, name, LOST_S, **fields)
-    return reply, own_time.seconds()
+    reply, _ = client.call(kind, f"{NODE}/{name}", LOST_S, **fields)
+    if reply is None:
+        ledger.found("lost", f"no reply of {name} after {after}")
+    else:
+        bound_s = FIRST_REPLY_S if is_first else REPLY_S
+        ledger.time(own_time.seconds(), bound_s, f"a reply of {name} after {after}")
+    return reply
 
 
 def stop(
@@ -184,10 +206,10 @@ def parameters(ledger: Ledger) -> None:
     ]
     values += ["", "x", [1.0], ["a"], []]
     with running() as (process, client):
-        names_of = f"{NODE}/list_parameters"
-        reply, _ = call(process, client, ListParameters, names_of)
+        reply = ask(
+            ledger, process, client, ListParameters, "list_parameters", "the start"
+        )
         if reply is None:
-            ledger.found("lost", "no list of parameters")
             return
         for number in ledger.cases(300, least=20):
             name, value = rng.choice(list(reply.result.names)), rng.choice(values)
@@ -195,19 +217,18 @@ def parameters(ledger: Ledger) -> None:
                 message = Parameter(name, value=value).to_parameter_msg()
             except (TypeError, AssertionError, OverflowError):
                 continue
-            done, took = call(
+            after = f"{name} = {value}"
+            values_set = {"parameters": [message]}
+            ask(
+                ledger,
                 process,
                 client,
                 SetParameters,
-                f"{NODE}/set_parameters",
-                parameters=[message],
+                "set_parameters",
+                after,
+                **values_set,
             )
-            ledger.time(took, math.inf, name)
-            if done is None:
-                ledger.found("lost", f"no reply to {name} = {value}")
-            if number % 50 == 0 and not is_alive(
-                ledger, process, client, f"{name} = {value}"
-            ):
+            if number % 50 == 0 and not is_alive(ledger, process, client, after):
                 return
         is_alive(ledger, process, client, "all parameters")
         stop(ledger, process)
@@ -301,7 +322,7 @@ def _time_fault(ledger: Ledger, process: Process, client: Client) -> None:
     from std_srvs.srv import SetBool, Trigger
 
     phases: list[str] = []
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     client.node.create_subscription(
         String, f"{NODE}/phase", lambda message: phases.append(message.data), latched
     )
@@ -311,20 +332,17 @@ def _time_fault(ledger: Ledger, process: Process, client: Client) -> None:
         ledger.found("lost", "no phase, or no subscription of commands")
         return
     commands.publish(Float64MultiArray(data=[0.01, 0.0, 0.0]))
+    # The command waits until the code of the scene is loaded.
+    if not client.until(lambda: "running" in phases, LOST_S):
+        ledger.found("lost", f"no run, the phases are {phases}")
+        return
     own_time = OwnTime(process.pid, os.getpid())
     if not client.until(lambda: phases[-1].startswith("fault"), LOST_S):
-        ledger.found("lost", f"no fault, the phase is {phases[-1:]}")
+        ledger.found("lost", f"no fault, the phases are {phases}")
         return
     ledger.time(own_time.seconds(), FAULT_S, "the fault")
-    for kind, name, fields in (
-        (SetBool, "pause", {"data": True}),
-        (Trigger, "reset", {}),
-    ):
-        reply, took = call(process, client, kind, f"{NODE}/{name}", **fields)
-        if reply is None:
-            ledger.found("lost", f"no reply of {name}")
-        else:
-            ledger.time(took, REPLY_S, name)
+    ask(ledger, process, client, SetBool, "pause", "the fault", data=True)
+    ask(ledger, process, client, Trigger, "reset", "the fault")
 
 
 def starts(ledger: Ledger) -> None:

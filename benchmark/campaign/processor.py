@@ -17,7 +17,8 @@ class OwnTime:
 
     A busy machine makes these waits long, a fault of the program makes the rest long.
     The kernel counts them for each thread (/proc/PID/task/TID/schedstat); where it does
-    not, this is the time of the clock.
+    not, this is the time of the clock. Waits of a thread that ends between two looks
+    are not seen.
 
     Args:
         pids: numbers of the processes.

@@ -290,7 +290,7 @@ FAR = 0.2
 
 
 @cache
-def _measured() -> dict[str, Array]:
+def exact_measurement() -> dict[str, Array]:
     """Return an exact motion of a second, as arrays."""
 
     def torque(t: float) -> tuple[float, float, float]:
@@ -312,7 +312,7 @@ def measurements(ledger: Ledger) -> None:
     true = scene.star.inertia
     assert true is not None
     for number in ledger.numbers(60, least=3):
-        data = dict(_measured())
+        data = dict(exact_measurement())
         if rng.random() < 0.6:
             del data["gamma_dot"]
         how = _spoil(rng, data)

@@ -1,30 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a wrong sign, unit, leg or time are refused or warned of by name."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 
-from sst_ros import identify, load_scene, simulate
+from benchmark.campaign.users import MEASURED_SCENE as SCENE
+from benchmark.campaign.users import exact_measurement as exact
+from sst_ros import identify, load_scene
 from sst_ros.errors import InputError
-
-SCENE = "example2_heavy"
-
-
-def torque(t):
-    return 0.3 * np.sin(3 * t), 0.3 * np.sin(5 * t + 1), 0.2 * np.cos(4 * t)
-
-
-@cache
-def exact():
-    motion = simulate(SCENE, torque, 1.0, samples=500)
-    return {
-        "t": motion.t,
-        "gamma": motion.gamma,
-        "gamma_dot": motion.gamma_dot,
-        "torque": motion.torque,
-    }
 
 
 def angles():
