@@ -10,7 +10,7 @@ from benchmark.campaign.ledger import PARTS, Ledger, run_part
 from sst_ros.errors import EXTRAS, SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
-LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads"}
+LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads", "surroundings"}
 NEEDS = {
     "bits": ("llvmlite",),
     "damage": ("mcap", "rosbags"),
