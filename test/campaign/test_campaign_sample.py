@@ -16,7 +16,7 @@ from benchmark.campaign.processor import communicate, wait_for_end
 from sst_ros.errors import EXTRAS, SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
-LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads"}
+LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads", "surroundings"}
 NEEDS = {
     "bits": ("llvmlite",),
     "damage": ("mcap", "rosbags"),

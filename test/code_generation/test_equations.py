@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 from loaded_scenes import loaded
+from slow_cases import slow_except
 
 import sst_ros
 from sst_ros import InputError, equations, load_scene
@@ -28,6 +29,9 @@ jax = pytest.importorskip("jax", reason="needs jax: pip install .[test]")
 jax.config.update("jax_enable_x64", True)  # no other test has JAX
 
 SCENES = [*names(), "loaded", "own loads"]
+QUICK = ("general", "loaded", "own loads")
+"""Scenes with every term and every function."""
+QUICK_IN_C = (*QUICK, "friction", "elastic_stops")
 OWN = (
     "tanh(beta_2) + positive(mu_1 - 0.1)**2"
     " + max(R11, -2) * abs(R22) / (2 + min(R33, 5))"
@@ -107,7 +111,7 @@ class Compiled:
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_except(QUICK_IN_C, SCENES))
 def test_c_has_the_bits_of_the_package(name, tmp_path):
     flags = FAST if name in ("friction", "loaded", "general") else STRICT
     compiled = Compiled(scene_of(name), tmp_path, flags)
@@ -128,7 +132,7 @@ def call(functions, output, state, drive):
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_except(QUICK, SCENES))
 def test_a_library_of_python_has_the_values_of_the_package(name, library):
     pytest.importorskip(library, reason=f"needs {library}: pip install .[test]")
     functions = equations(scene_of(name), library)
@@ -255,6 +259,7 @@ def test_mpmath_has_more_digits():
         assert mpmath.mp.dps == 50 and fine[4] != float(fine[4])
 
 
+@pytest.mark.slow
 def test_sympy_takes_symbols():
     """Of symbols the results are expressions: their values, and Euler's theorem."""
     sympy = pytest.importorskip("sympy", reason="needs sympy: pip install .[test]")

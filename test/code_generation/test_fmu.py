@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
+from slow_cases import slow_except
 
 from sst_ros import TorqueTable, load_scene, simulate
 from sst_ros.code_generation.equations import equations
@@ -20,6 +21,7 @@ fmpy = pytest.importorskip("fmpy", reason="needs fmpy: pip install .[test]")
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 GAMMA = ("gamma_1", "gamma_2", "gamma_3")
+QUICK = ("elastic_stops", "friction", "general")
 PERIOD = 0.01  # of torques that are held [s]
 COUNT = 10
 EXACT = 1e-12  # of angles [rad]
@@ -80,7 +82,7 @@ def expected(scene, torques):
     return motion.gamma
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", slow_except(QUICK, names()))
 def test_co_simulation_is_the_motion_of_simulate(name, tmp_path):
     scene, torques = load_scene(name), held_torques(1)
     path = write(scene, tmp_path)
@@ -111,7 +113,7 @@ def test_fixed_steps_converge_with_order_eight(tmp_path):
     assert 6.5 < np.log2(errors[0] / errors[1]) < 9.5, errors
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", slow_except(QUICK, names()))
 def test_short_fixed_steps_are_the_motion_of_simulate(name, tmp_path):
     scene, torques = load_scene(name), held_torques(5)[:3]
     path = write(scene, tmp_path)
@@ -120,7 +122,7 @@ def test_short_fixed_steps_are_the_motion_of_simulate(name, tmp_path):
     assert np.abs(found - expected(scene, torques)).max() < EXACT
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", slow_except(QUICK, names()))
 def test_model_exchange_gives_the_derivative(name, tmp_path):
     scene, duration = load_scene(name), 0.05
     path, torque = write(scene, tmp_path), [0.4, -0.2, 0.3]
@@ -191,7 +193,7 @@ def test_what_is_not_finite_is_refused(tmp_path):
         unit.doStep(currentCommunicationPoint=0.0, communicationStepSize=PERIOD)
 
 
-@pytest.mark.parametrize("scene", [*names(), "loaded"])
+@pytest.mark.parametrize("scene", slow_except([*QUICK, "loaded"], [*names(), "loaded"]))
 def test_fmpy_finds_the_unit_valid(scene, tmp_path):
     from fmpy.validation import validate_fmu
 

@@ -99,7 +99,9 @@ def differences(scene, y, torque, coordinates, dt):
     return found[:-3].T, found[-3:].T
 
 
-@pytest.mark.parametrize("coordinates", ["gamma", "star"])
+@pytest.mark.parametrize(
+    "coordinates", ["gamma", pytest.param("star", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("lag", [pytest.param(None, marks=pytest.mark.slow), 0.1])
 @pytest.mark.parametrize("dt", [None, 2e-3])
 def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):

@@ -17,6 +17,7 @@ from loaded_scenes import loaded
 from mechanism.closed_chains import ISOTROPIC, random_sample
 from models import assembly_of, seeded_samples
 from scipy.spatial.transform import Rotation
+from slow_cases import slow_except
 
 from sst_ros.__main__ import main
 from sst_ros.description.robot import (
@@ -205,7 +206,7 @@ def acceleration(scene, angles, motion, torque, moment=(0.0, 0.0, 0.0)):
     return read.data.a[model.getJointId("beta_1")].angular
 
 
-@pytest.mark.parametrize("seed", range(32))
+@pytest.mark.parametrize("seed", slow_except(range(6), range(32)))
 def test_motion_of_random_mechanisms(seed):
     """Other engines are compared, on one scene, in test/benchmark/test_peers.py."""
     sample = random_sample(

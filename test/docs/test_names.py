@@ -35,8 +35,10 @@ TEXTS = [
 ]
 
 
-def split(source):
+@cache
+def split(path):
     """Docstrings and comments of a program, and the rest of it."""
+    source = path.read_text(encoding="utf-8")
     lines = source.splitlines()
     said = []
     for node in ast.walk(ast.parse(source)):
@@ -55,7 +57,7 @@ def code():
     """Every word of the code, of scenes and of settings."""
     words = {*dir(builtins), *sys.stdlib_module_names, "scipy", "PPoly"}
     for path in found("*.py"):
-        words |= set(re.findall(r"\w+", split(path.read_text(encoding="utf-8"))[1]))
+        words |= set(re.findall(r"\w+", split(path)[1]))
     for path in (
         *ROOT.glob("config/**/*.yaml"),
         *ROOT.glob("*.cfg"),
@@ -94,8 +96,8 @@ def test_what_a_text_names_is_there():
     """In the package's docstrings and comments, words in backquotes are names, too."""
     stale = {}
     for path in TEXTS:
-        text, program = path.read_text(encoding="utf-8"), path.suffix == ".py"
-        said = split(text)[0] if program else text
+        program = path.suffix == ".py"
+        said = split(path)[0] if program else path.read_text(encoding="utf-8")
         names = program and ROOT / "sst_ros" in path.parents
         if gone := list(missing(said, names=names)):
             stale[str(path.relative_to(ROOT))] = gone

@@ -94,15 +94,13 @@ def test_a_jump_of_an_encoder_is_refused_with_its_row(last):
         identify(data | {"gamma": gamma}, SCENE)
 
 
-def test_columns_that_do_not_change_are_told():
+@pytest.mark.parametrize("name", ["torque", "gamma"])
+def test_columns_that_do_not_change_are_told(name):
     data = angles()
-    for name in ("torque", "gamma"):
-        values = data[name].copy()
-        values[:, 1] = values[0, 1]
-        found = identify(data | {name: values}, SCENE)
-        assert any(
-            f"{name}_2 is" in one and "measured" in one for one in found.warnings
-        )
+    values = data[name].copy()
+    values[:, 1] = values[0, 1]
+    found = identify(data | {name: values}, SCENE)
+    assert any(f"{name}_2 is" in one and "measured" in one for one in found.warnings)
 
 
 def test_angles_that_are_taken_in_time_and_are_late_are_told():

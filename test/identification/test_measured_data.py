@@ -100,16 +100,21 @@ def test_feedforward_errs_20_times_less_than_by_the_wrong_model(seed):
     assert np.linalg.norm(wrong - exact) > 20.0 * np.linalg.norm(right - exact)
 
 
-def test_noise_is_found_and_may_be_given():
+@pytest.mark.slow
+def test_noise_is_found():
     case = measured()
     several = [identify(case.recording(seed), case.model) for seed in range(6)]
-    found = several[0]
     true = NOISE * np.abs(case.torque).max(axis=0)
     # One estimate, by some 40 equations of an actuator, errs by 11 %, the mean of six
     # by 5 %.
     assert np.mean([one.noise for one in several], axis=0) == pytest.approx(
         true, rel=0.1
     )
+
+
+def test_noise_may_be_given():
+    case = measured()
+    found = identify(case.recording(0), case.model)
     given = identify(case.recording(0), case.model, noise=2.0 * found.noise)
     assert given.deviation == pytest.approx(2.0 * found.deviation, rel=1e-9)
     assert given.estimate == pytest.approx(found.estimate, rel=1e-9, abs=1e-12)

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from loaded_scenes import IGNORE, loaded, start_of, viscous
 from models import seeded_samples
+from slow_cases import slow_except
 
 from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics import kernel
@@ -174,6 +175,7 @@ def test_a_slope_of_its_own_needs_an_explicit_method():
 # Compiled code belongs to a structure: scenes that differ in numbers alone share it.
 
 SCENES = sorted(path.stem for path in Path("config/scenes").glob("*.yaml"))
+QUICK = ("elastic_stops", "friction", "general")
 
 
 def perturb(value, rng, size=0.1):
@@ -212,7 +214,7 @@ def text_of(ode, *, implicit=False):
     return module.text, module.numbers
 
 
-@pytest.mark.parametrize("name", [*SCENES, "loaded"])
+@pytest.mark.parametrize("name", slow_except([*QUICK, "loaded"], [*SCENES, "loaded"]))
 def test_all_scenes_of_a_kind_have_one_text(name):
     """The shipped ones have equal legs and equal moments, which the others have not."""
     scene, rng = loaded() if name == "loaded" else load(name), np.random.default_rng(7)
@@ -343,7 +345,7 @@ def test_many_steps_at_once_have_the_bits_of_each(start):
         assert state == steps.single(row[0], row[1], y, drive)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", slow_except(QUICK, SCENES))
 def test_a_text_for_all_scenes_has_hardly_more_operations(name):
     """Against the trace that merges and folds whatever is equal in this scene."""
     ode = recent_ode(Dynamics.of(load(name)), work=True)

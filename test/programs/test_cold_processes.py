@@ -9,7 +9,11 @@ import pytest
 
 from sst_ros import simulate
 
-REPEATS = 3
+REPEATS = [
+    0,
+    pytest.param(1, marks=pytest.mark.slow),
+    pytest.param(2, marks=pytest.mark.slow),
+]
 SCENE = "example2_heavy"
 
 BEGIN = """
@@ -123,7 +127,7 @@ def run_code(code, timeout=120, **changes):
     return result.stdout.split()
 
 
-@pytest.mark.parametrize("repeat", range(REPEATS))
+@pytest.mark.parametrize("repeat", REPEATS)
 def test_eight_cold_threads_have_the_bits_of_one(repeat):
     assert run_code(BEGIN + THREADS) == ["8", bits_here()]
 
@@ -142,7 +146,7 @@ def test_a_home_that_cannot_be_written_to_is_no_hindrance(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
-@pytest.mark.parametrize("repeat", range(REPEATS))
+@pytest.mark.parametrize("repeat", REPEATS)
 def test_processes_forked_while_a_thread_compiles_have_its_bits(repeat):
     """A child neither hangs nor computes other numbers.
 

@@ -431,6 +431,7 @@ def test_only_what_is_exactly_zero_hides_a_kink(number):
             product + 1.0
 
 
+@pytest.mark.slow
 def test_elastic_stops_are_passed_and_the_contact_is_enclosed():
     proven, motion = (
         certify("impacts", None, 0.95, t_eval=[0.9, 0.95]),

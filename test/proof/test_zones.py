@@ -236,6 +236,7 @@ def test_no_refuted_pose_is_regular_at_the_given_geometry(name):
     assert (by_j2 > 0.01) == (name == "folded")
 
 
+@pytest.mark.slow
 def test_a_cap_is_proven_up_to_the_nearest_limit():
     # The least tilt that meets a limit, by bisection on many azimuths.
     scene = load_scene("general")
@@ -257,7 +258,7 @@ def test_a_cap_is_proven_up_to_the_nearest_limit():
     assert beyond.nearest.distance < low + 0.02
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.1])
+@pytest.mark.parametrize("tolerance", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_random_angles_of_a_box_have_a_regular_assembly(tolerance):
     scene = load_scene("general")
     box = np.array([[0.25, 1.2], [0.3, 1.1], [0.3, 1.15]])

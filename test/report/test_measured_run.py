@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from slow_cases import slow_except
 
 from sst_ros import __main__ as cli
 from sst_ros import identify, read_bag
@@ -23,6 +24,7 @@ KINDS = ("noise", "quantised", "delayed", "dropped")
 COMBINATIONS = [
     kinds for count in range(1, 5) for kinds in itertools.combinations(KINDS, count)
 ]
+QUICK = ("noise",), ("dropped",), ("quantised", "delayed"), KINDS
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,7 @@ def measure(bags, entries, kinds, monkeypatch, *, truth):
     return sorted([*others, *found], key=lambda one: one.received_ns)
 
 
-@pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
+@pytest.mark.parametrize("kinds", slow_except(QUICK, COMBINATIONS), ids="-".join)
 def test_with_the_truth_a_measured_run_is_evaluated_as_exact(
     read, bags, exact, monkeypatch, kinds
 ):
@@ -93,7 +95,7 @@ def test_with_the_truth_a_measured_run_is_evaluated_as_exact(
         assert off > 1e-4
 
 
-@pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
+@pytest.mark.parametrize("kinds", slow_except(QUICK, COMBINATIONS), ids="-".join)
 def test_without_the_truth_a_measured_run_is_judged_by_its_own(
     read, bags, exact, monkeypatch, kinds
 ):
@@ -147,7 +149,7 @@ def test_a_single_wrong_sample_is_an_error_and_no_measurement(read, bags, exact)
 
 
 def test_pictures_show_the_truth_and_what_was_measured(
-    written, bags, exact, monkeypatch, tmp_path
+    written, bags, exact, monkeypatch, tmp_path, undrawn
 ):
     path = written(measure(bags, exact, ("noise",), monkeypatch, truth=True))
     run = read_bag(path).signals
@@ -163,7 +165,7 @@ def test_pictures_show_the_truth_and_what_was_measured(
     assert cli.main(["plot", str(path), "--out", str(tmp_path / "plots")]) == 0
 
 
-@pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
+@pytest.mark.parametrize("kinds", slow_except(QUICK, COMBINATIONS), ids="-".join)
 def test_pictures_of_each_combination_show_truth_and_measurement(
     written, bags, exact, monkeypatch, kinds
 ):
@@ -189,7 +191,7 @@ def longer(bags):
 
 
 @pytest.mark.parametrize("truth", [True, False], ids=["with the truth", "without"])
-@pytest.mark.parametrize("kinds", COMBINATIONS, ids="-".join)
+@pytest.mark.parametrize("kinds", slow_except(QUICK, COMBINATIONS), ids="-".join)
 def test_each_combination_is_identified(read, bags, longer, monkeypatch, kinds, truth):
     """By what was measured: the delay, and inertias within five deviations."""
     monkeypatch.setattr(sys.modules[__name__], "NOISE", 2e-5)

@@ -146,8 +146,10 @@ def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
 
 
 SHIPPED = {
-    **dict.fromkeys(("example2", "stiff", "gravity_payload"), ()),
-    **dict.fromkeys(("elastic_stops", "fast_spin", "friction"), (pytest.mark.slow,)),
+    **dict.fromkeys(("example2", "gravity_payload"), ()),
+    **dict.fromkeys(
+        ("elastic_stops", "fast_spin", "friction", "stiff"), (pytest.mark.slow,)
+    ),
 }
 
 

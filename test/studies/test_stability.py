@@ -138,7 +138,11 @@ PROOF = needs("flint")
         # passes no limit, which a first look cannot say
         pytest.param("time x 10", r"\d\.\de-12 rad", marks=PROOF),
         pytest.param("square wave of 2 N m", r"\d\.\de-1[56] rad", marks=PROOF),
-        pytest.param("stops of 1000 N m/rad", r"\d\.\de-12 rad", marks=PROOF),
+        pytest.param(
+            "stops of 1000 N m/rad",
+            r"\d\.\de-12 rad",
+            marks=[PROOF, pytest.mark.slow],
+        ),
         ("start at a corner that cannot be assembled", "-: there is no motion"),
         (
             "sampled PD control at 0.98 of the limit of its bandwidth",
