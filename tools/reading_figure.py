@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmark.measure import DOCS
 from sst_ros.figures import BLUE, GREY, INK, save_figure, styled
-from sst_ros.identification.identify import describe_combination
+from sst_ros.identification.simulation_fit import describe_combination
 from sst_ros.mechanism.geometry import Array, rotation_matrix, zyz_angles
 from sst_ros.scene.scene import load
 from sst_ros.scene.yaml_document import find_number

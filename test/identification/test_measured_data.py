@@ -10,7 +10,8 @@ from identification import manipulators
 from sst_ros import load_scene, reference_motion
 from sst_ros.errors import InputError
 from sst_ros.identification import parameters
-from sst_ros.identification.identify import filter_angles, find_bandwidth, identify
+from sst_ros.identification.identify import identify
+from sst_ros.identification.measured_path import filter_angles, find_bandwidth
 
 COUNT = 2.0 * np.pi / 65536
 NOISE = 0.01
