@@ -45,7 +45,7 @@ from sst_ros.mechanism.geometry import Array
 LEAST_NOISE = 1e-12
 VARIANCE_STEPS = 2  # fits by which the noise is estimated: unweighted, and weighted
 # of the variance from rest to the highest frequency, looked through: none, and from
-# what nobody sees to angles alone
+# what is too small to see to noise of angles alone
 GROWTHS = np.append(0.0, np.geomspace(0.05, 500.0, 41))
 SMALLEST_VARIANCE = 1e-300  # of residuals that are zero
 INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start

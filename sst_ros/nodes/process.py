@@ -422,7 +422,7 @@ def run(words: Sequence[str]) -> int:
 
 
 def _leave_compilation(status: int) -> None:
-    """End the process now where a thread compiles what nobody waits for any more.
+    """End the process now where a thread compiles what no caller waits for any more.
 
     LLVM can neither be interrupted nor taken down below that thread; by now the node
     has left and its files are closed.
