@@ -13,7 +13,7 @@ import time
 import webbrowser
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import trimesh
@@ -31,7 +31,8 @@ from sst_ros.view.source import Replay, RunControl, ViewState
 
 PERIOD_S = 1.0 / 30.0
 # frames between two updates of the numbers, and of the plots
-_SHOW_EVERY, _DRAW_EVERY = 3, 6
+_SHOW_EVERY = 3
+_DRAW_EVERY = 6
 _PANEL_WIDTH = 400.0
 _LARGEST_TORQUE = 5.0  # range of the torque sliders where the scene has no limit [N m]
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
@@ -47,6 +48,14 @@ _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
 # controls as in a phase, at a time [s]
 Show: TypeAlias = Callable[[str, float | None], None]
 _PANEL: Any = load_templates("view").get_template("panel.html").module
+
+
+class _PlotSample(NamedTuple):
+    """What the plots show of a state."""
+
+    time: float  # [s]
+    degrees: Array  # actuator angles [deg], shape (3,)
+    torque: Sequence[float]  # [N m], shape (3,)
 
 
 class Page:
@@ -114,30 +123,37 @@ class Page:
     def _build(self, scene: Scene) -> None:
         """Replace the scene that is shown: picture, numbers, plots and controls."""
         self._clear()
-        server, gui, source = self._server, self._server.gui, self._source
-        self._scene, self._state = scene, None
-        self._show_controls = (
-            _add_replay_controls(server, source)
-            if isinstance(source, Replay)
-            else _add_run_controls(server, scene, source)
-        )
+        server = self._server
+        gui = server.gui
+        self._scene = scene
+        self._state = None
+        if isinstance(self._source, Replay):
+            self._show_controls = _add_replay_controls(server, self._source)
+        else:
+            self._show_controls = _add_run_controls(server, scene, self._source)
         self._drawing = SceneDrawing(server, scene)
         self._head = gui.add_html("", order=0.0)
         self._joints = gui.add_html("", order=2.0)
         with gui.add_folder("actuator angles γ, last 10 s", order=3.0):
-            gamma = _plot(server, "γ [deg]", (0.0, 90.0))
+            self._angle_plot = _plot(server, "γ [deg]", (0.0, 90.0))
         with gui.add_folder("torques τ, last 10 s", order=4.0):
-            self._plots = gamma, _plot(server, "τ [N m]", (-1.0, 1.0))
+            self._torque_plot = _plot(server, "τ [N m]", (-1.0, 1.0))
         with gui.add_folder("status of the run", order=6.0):
             self._status = gui.add_html("")
-        self._rows: deque[tuple[float, ...]] = deque(maxlen=_CURVE_POINTS)
+        self._samples: deque[_PlotSample] = deque(maxlen=_CURVE_POINTS)
+        self._place_cameras(scene)
+
+    def _place_cameras(self, scene: Scene) -> None:
+        """Look at the manipulator from outside, over the middle of the base."""
         middle = Geometry.of(scene).v.sum(axis=0)
         middle /= np.linalg.norm(middle)
         size = max(scene.base.radius, scene.star.radius)
-        cameras: list[Any] = [client.camera for client in server.get_clients().values()]
-        for camera in (server.initial_camera, *cameras):
+        clients = self._server.get_clients().values()
+        cameras: list[Any] = [client.camera for client in clients]
+        for camera in (self._server.initial_camera, *cameras):
             camera.position = size * (3.9 * middle + np.array([0.35, -0.55, 0.5]))
-            camera.look_at, camera.fov = 0.28 * size * middle, np.radians(35.0)
+            camera.look_at = 0.28 * size * middle
+            camera.fov = np.radians(35.0)
 
     def _update(self, count: int) -> None:
         """Take what is new, and show it where it is due."""
@@ -149,36 +165,40 @@ class Page:
             self._drawing.show(self._state.angles, self._state.torque)
         if count % _SHOW_EVERY == 0:
             self._show_numbers()
-        if count % _DRAW_EVERY == 0 and len(self._rows) >= 2:
-            rows = np.array(self._rows)
-            rows = rows[rows[:, 0] > rows[-1, 0] - _WINDOW_S]
-            for plot, columns in zip(
-                self._plots, (rows[:, 1:4], rows[:, 4:7]), strict=True
-            ):
-                plot.data = (rows[:, 0], *columns.T.copy())
+        if count % _DRAW_EVERY == 0 and len(self._samples) >= 2:
+            self._draw_plots()
+
+    def _draw_plots(self) -> None:
+        """Show the samples of the last ten seconds."""
+        begin = self._samples[-1].time - _WINDOW_S
+        samples = [sample for sample in self._samples if sample.time > begin]
+        times = np.array([sample.time for sample in samples])
+        degrees = np.array([sample.degrees for sample in samples])
+        torques = np.array([sample.torque for sample in samples])
+        self._angle_plot.data = (times, *degrees.T.copy())
+        self._torque_plot.data = (times, *torques.T.copy())
 
     def _add_to_plots(self, state: ViewState) -> None:
         """Add a state to the plots; a time that goes back begins new ones."""
         if state.time is None:
             return
-        if self._rows and state.time < self._rows[-1][0]:
-            self._rows.clear()
-        if (
-            not self._rows
-            or state.time - self._rows[-1][0] >= _WINDOW_S / _CURVE_POINTS
-        ):
-            self._rows.append((state.time, *np.degrees(state.gamma), *state.torque))
+        if self._samples and state.time < self._samples[-1].time:
+            self._samples.clear()
+        spacing = _WINDOW_S / _CURVE_POINTS
+        if not self._samples or state.time - self._samples[-1].time >= spacing:
+            degrees = np.degrees(state.gamma)
+            self._samples.append(_PlotSample(state.time, degrees, state.torque))
 
     def _show_numbers(self) -> None:
         """Show name, phase, time, numbers of the state, and what is possible now."""
-        state, status = self._state, self._source.status()
-        phase, time = (
-            status.phase or "no simulator",
-            None if state is None else state.time,
-        )
-        colour = _LEVELS[2 if phase.startswith("fault") else status.level]
+        state = self._state
+        status = self._source.status()
+        phase = status.phase or "no simulator"
+        time = None if state is None else state.time
         time_text = "–" if time is None else f"{time:.2f} s"
-        self._head.content = str(_PANEL.head(self._scene, phase, colour, time_text))
+        level = 2 if phase.startswith("fault") else status.level
+        head = _PANEL.head(self._scene, phase, _LEVELS[level], time_text)
+        self._head.content = str(head)
         if state is not None:
             self._joints.content = str(_PANEL.joints(_COLOURS, state))
             panel = _PANEL.status(_LEVELS[status.level], status.message, status.values)
@@ -212,7 +232,8 @@ def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show
 
     The function returned enables what is possible in a phase.
     """
-    gui, most = server.gui, scene.torque_limit or _LARGEST_TORQUE
+    gui = server.gui
+    most = scene.torque_limit or _LARGEST_TORQUE
     with gui.add_folder("run", order=1.0):
         pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         step = gui.add_button(
@@ -283,10 +304,11 @@ def _add_replay_controls(server: PageServer, replay: Replay) -> Show:
             replay.seek(float(slider.value))
 
     def show(_: str, time: float | None) -> None:
-        before, playing = play.label == "Pause", replay.playing
-        if playing != before:
+        was_playing = play.label == "Pause"
+        playing = replay.playing
+        if playing != was_playing:
             _name(play, "Pause" if playing else "Play")
-        if (playing or before) and time is not None:
+        if (playing or was_playing) and time is not None:
             _move(slider, round(min(time, replay.length), 6))
 
     play.on_click(lambda _: replay.play(not replay.playing))
@@ -314,7 +336,8 @@ _LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
 
 Newer parts above older ones.
 """
-_OLD, _NEW = np.array([0.90, 0.86, 0.92]), np.array([0.42, 0.00, 0.42])
+_OLD_COLOUR = np.array([0.90, 0.86, 0.92])
+_NEW_COLOUR = np.array([0.42, 0.00, 0.42])
 ROOT = "/manipulator"
 _SIDES = 20  # corners of an arc's cross-section
 
@@ -323,7 +346,9 @@ class SceneDrawing:
     """One scene as drawn, in nodes below ROOT."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene) -> None:
-        self._server, self._scene, self._geometry = server, scene, Geometry.of(scene)
+        self._server = server
+        self._scene = scene
+        self._geometry = Geometry.of(scene)
         self._joints = robot.joints_of(self._geometry)
         self._frames = {}
         for link, drawn in robot.shapes(scene).items():
@@ -332,17 +357,17 @@ class SceneDrawing:
             )
             for index, shape in enumerate(drawn):
                 add_shape(server, f"{ROOT}/{link}/{index}", shape)
-        self._size = size = max(scene.base.radius, scene.star.radius)
+        self._size = max(scene.base.radius, scene.star.radius)
         self._add_labels()
         self._points: deque[tuple[float, Array]] = deque(maxlen=PATH_POINTS)
         self._last = -np.inf
         fade = np.linspace(0.0, 1.0, PATH_POINTS)[:, None]
-        colours = (1.0 - fade) * _OLD + fade * _NEW
+        colours = (1.0 - fade) * _OLD_COLOUR + fade * _NEW_COLOUR
         self._path = server.scene.add_line_segments(
             f"{ROOT}/path",
             np.zeros((PATH_POINTS - 1, 2, 3)),
             np.stack([colours[:-1], colours[1:]], axis=1),
-            thickness=0.016 * size,
+            thickness=0.016 * self._size,
         )
         outward = scene.star.radius * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.28]])
         self._add_arrow(
@@ -379,26 +404,33 @@ class SceneDrawing:
         for link, frame in self._frames.items():
             frame.wxyz = wxyz(rotations[link])
         end = self._scene.star.radius * rotations[robot.STAR_LINK][:, 2]
-        points = np.array([*(point for _, point in self._points), end])[-PATH_POINTS:]
-        points = np.concatenate(
-            [np.repeat(points[:1], PATH_POINTS - len(points), axis=0), points]
-        )
-        points *= _LIFT
-        self._path.points = np.stack([points[:-1], points[1:]], axis=1).astype(
-            np.float32
-        )
-        # tau_k along w_k, outwards where positive; the largest yet has full length
+        self._show_path(end)
+        # The largest torque yet has an arrow of full length.
         self._largest_torque = max(self._largest_torque, *map(abs, torque))
         for arrow, tau, w in zip(self._torques, torque, self._geometry.w, strict=True):
-            length = 0.45 * self._size * abs(tau) / self._largest_torque
-            visible = length > 0.01 * self._size
-            if visible:
-                foot = 1.17 * self._scene.base.radius
-                ends = np.array([foot * w, (foot + length) * w])
-                arrow.points = (ends if tau > 0.0 else ends[::-1]).astype(np.float32)[
-                    None
-                ]
-            arrow.visible = visible
+            self._show_torque(arrow, tau, w)
+
+    def _show_path(self, end: Array) -> None:
+        """Show the points of the path and E, shape (3,); the first fills the rest."""
+        path = [point for _, point in self._points]
+        points = np.array([*path, end])[-PATH_POINTS:]
+        filling = np.repeat(points[:1], PATH_POINTS - len(points), axis=0)
+        points = np.concatenate([filling, points])
+        points *= _LIFT
+        segments = np.stack([points[:-1], points[1:]], axis=1)
+        self._path.points = segments.astype(np.float32)
+
+    def _show_torque(self, arrow: viser.ArrowsHandle, tau: float, w: Array) -> None:
+        """Show a torque tau_k along w_k, outwards where it is positive."""
+        length = 0.45 * self._size * abs(tau) / self._largest_torque
+        visible = length > 0.01 * self._size
+        if visible:
+            foot = 1.17 * self._scene.base.radius
+            ends = np.array([foot * w, (foot + length) * w])
+            if tau <= 0.0:
+                ends = ends[::-1]
+            arrow.points = ends.astype(np.float32)[None]
+        arrow.visible = visible
 
     def _add_arrow(
         self,
@@ -430,19 +462,19 @@ class SceneDrawing:
         outwards = v - v.mean(axis=0)
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
         points = self._scene.base.radius * (v + 0.13 * outwards)
+        for k, position in enumerate(points, 1):
+            self._add_label(f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", position)
         end = self._scene.star.radius * np.array([0.0, 0.0, 1.36])
-        places = [
-            (f"{robot.BASE}/P{k}", f"P{'₁₂₃'[k - 1]}", position)
-            for k, position in enumerate(points, 1)
-        ]
-        for name, text, position in (*places, (f"{robot.STAR_LINK}/E", "E", end)):
-            self._server.scene.add_label(
-                f"{ROOT}/{name}",
-                text,
-                position=position,
-                anchor="center-center",
-                font_screen_scale=2.0,
-            )
+        self._add_label(f"{robot.STAR_LINK}/E", "E", end)
+
+    def _add_label(self, name: str, text: str, position: Array) -> None:
+        self._server.scene.add_label(
+            f"{ROOT}/{name}",
+            text,
+            position=position,
+            anchor="center-center",
+            font_screen_scale=2.0,
+        )
 
 
 def add_shape(server: viser.ViserServer, name: str, shape: robot.Shape) -> None:
@@ -458,31 +490,36 @@ def add_shape(server: viser.ViserServer, name: str, shape: robot.Shape) -> None:
     elif isinstance(shape, robot.Box):
         scene.add_box(name, shape.colour, shape.size, position=shape.centre)
     elif isinstance(shape, robot.Arc):
-        turns = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
-        outline = np.stack([np.cos(turns), np.sin(turns)], axis=1) * shape.thickness
-        mesh = trimesh.creation.revolve(
-            outline + np.array([shape.radius, 0.0]),
-            angle=shape.angle,
-            sections=len(shape.points()),
-        )
-        frame = np.stack(
-            [shape.begin, np.cross(shape.axis, shape.begin), shape.axis], axis=1
-        )
-        scene.add_mesh_simple(
-            name, mesh.vertices @ frame.T, mesh.faces, color=shape.colour
-        )
-        for index, end in enumerate(shape.points()[[0, -1]]):
-            add_shape(
-                server,
-                f"{name}/{index}",
-                robot.Ball(end, shape.thickness, shape.colour),
-            )
+        _add_arc(server, name, shape)
     else:
         along = shape.end - shape.begin
-        middle, length = (shape.begin + shape.end) / 2.0, float(np.linalg.norm(along))
-        turn = wxyz(Rotation.align_vectors(along, [0.0, 0.0, 1.0])[0].as_matrix())
-        size = shape.thickness, length
-        scene.add_cylinder(name, *size, shape.colour, position=middle, wxyz=turn)
+        turn, _ = Rotation.align_vectors(along, [0.0, 0.0, 1.0])
+        scene.add_cylinder(
+            name,
+            shape.thickness,
+            float(np.linalg.norm(along)),
+            shape.colour,
+            position=(shape.begin + shape.end) / 2.0,
+            wxyz=wxyz(turn.as_matrix()),
+        )
+
+
+def _add_arc(server: viser.ViserServer, name: str, arc: robot.Arc) -> None:
+    """Add a round bar along an arc, with a ball at each end."""
+    turns = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
+    outline = np.stack([np.cos(turns), np.sin(turns)], axis=1) * arc.thickness
+    mesh = trimesh.creation.revolve(
+        outline + np.array([arc.radius, 0.0]),
+        angle=arc.angle,
+        sections=len(arc.points()),
+    )
+    across = np.cross(arc.axis, arc.begin)
+    frame = np.stack([arc.begin, across, arc.axis], axis=1)
+    vertices = mesh.vertices @ frame.T
+    server.scene.add_mesh_simple(name, vertices, mesh.faces, color=arc.colour)
+    for index, end in enumerate(arc.points()[[0, -1]]):
+        ball = robot.Ball(end, arc.thickness, arc.colour)
+        add_shape(server, f"{name}/{index}", ball)
 
 
 def wxyz(rotation: Array) -> Array:

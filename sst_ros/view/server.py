@@ -73,45 +73,54 @@ class AccessCheck:
 
     def refusal(self, local: tuple[str, int], request: Request) -> str:
         """Return why a request at a local address is refused; empty if it is not."""
-        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        names = (
-            self._names | {local[0]} | ({"localhost"} if _loopback(local[0]) else set())
-        )
+        address, port = local
+        hosts = request.headers.get_all("Host")
+        names = self._names | {address}
+        if _loopback(address):
+            names |= {"localhost"}
         if len(hosts) != 1 or _name(hosts[0]) not in names:
             return "This page answers only to its own address."
-        if any(
-            origin not in (f"http://{hosts[0]}", f"https://{hosts[0]}")
-            for origin in origins
-        ):
-            return "Another page must not use this one."
-        cookies = http.cookies.SimpleCookie()
-        with contextlib.suppress(http.cookies.CookieError):
-            cookies.load("; ".join(request.headers.get_all("Cookie")))
-        tokens = parse_qs(urlsplit(request.path).query).get("token", [])
-        if (morsel := cookies.get(COOKIE.format(local[1]))) is not None:
-            tokens.append(morsel.value)
-        if not any(
-            secrets.compare_digest(token.encode(), self.token.encode())
-            for token in tokens
-        ):
+        own_origins = (f"http://{hosts[0]}", f"https://{hosts[0]}")
+        for origin in request.headers.get_all("Origin"):
+            if origin not in own_origins:
+                return "Another page must not use this one."
+        if not any(map(self._is_token, _tokens_of(request, port))):
             return (
                 "Open the address that `view` has printed: it contains the access"
                 " token."
             )
         return ""
 
+    def _is_token(self, token: str) -> bool:
+        """Compare in a time that does not depend on the token."""
+        return secrets.compare_digest(token.encode(), self.token.encode())
+
     def _complete(self, response: Response, port: int) -> None:
         """Set the cookie, and the title of the browser's tab.
 
         Forbid frames and referrers.
         """
-        headers, title = response.headers, f"<title>{TITLE}</title>".encode()
+        headers = response.headers
+        title = f"<title>{TITLE}</title>".encode()
         response.body = response.body.replace(b"<title>Viser</title>", title, 1)
         del headers["Content-Length"]
         headers["Content-Length"] = str(len(response.body))
         cookie = f"{COOKIE.format(port)}={self.token}"
         headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
-        headers["X-Frame-Options"], headers["Referrer-Policy"] = "DENY", "no-referrer"
+        headers["X-Frame-Options"] = "DENY"
+        headers["Referrer-Policy"] = "no-referrer"
+
+
+def _tokens_of(request: Request, port: int) -> list[str]:
+    """Return the tokens in the address and in the cookie of a request."""
+    cookies = http.cookies.SimpleCookie()
+    with contextlib.suppress(http.cookies.CookieError):
+        cookies.load("; ".join(request.headers.get_all("Cookie")))
+    tokens = parse_qs(urlsplit(request.path).query).get("token", [])
+    cookie = cookies.get(COOKIE.format(port))
+    if cookie is not None:
+        tokens.append(cookie.value)
+    return tokens
 
 
 class PageServer(ViserServer):

@@ -88,11 +88,15 @@ class Replay:
         from sst_ros.recording.recording import read
 
         self._run = read(bag, namespace=namespace)
-        self.scene, self._seconds = self._run.scene, self._run.seconds
+        self.scene = self._run.scene
+        self._seconds = self._run.seconds
         self.length = float(self._seconds[-1])
         self._lock = threading.Lock()
-        self._time, self._since, self._factor = 0.0, time.monotonic(), 1.0
-        self.playing, self._sent = True, -1
+        self._time = 0.0  # of the recording [s]
+        self._since = time.monotonic()  # when `_time` was set
+        self._factor = 1.0
+        self.playing = True
+        self._sent = -1  # row of the last state that was returned
 
     def play(self, playing: bool) -> None:
         """Play or pause; play from the beginning at the end."""
@@ -118,14 +122,13 @@ class Replay:
         row = max(int(np.searchsorted(self._seconds, time + 1e-9, side="right")) - 1, 0)
         first = self._sent + 1 if row >= self._sent else 0
         self._sent = row
-        run, rows = self._run, slice(first, row + 1)
+        run = self._run
         columns = (run.gamma, run.mu, run.beta, run.gamma_dot, run.effort)
-        series = zip(
-            self._seconds[rows].tolist(),
-            *(column[rows] for column in columns),
-            strict=True,
-        )
-        return [ViewState(*sample) for sample in series]
+        states = []
+        for i in range(first, row + 1):
+            numbers = (column[i] for column in columns)
+            states.append(ViewState(float(self._seconds[i]), *numbers))
+        return states
 
     def status(self) -> RunStatus:
         """Return the last diagnostics of the recording."""
