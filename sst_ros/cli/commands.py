@@ -573,13 +573,9 @@ def run_command(arguments: list[str]) -> int:
     """
     end = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     debug = "--debug" in arguments[:end]  # wherever it is before the words of ROS
+    before_ros = [argument for argument in arguments[:end] if argument != "--debug"]
     try:
-        status = _run(
-            [
-                *(argument for argument in arguments[:end] if argument != "--debug"),
-                *arguments[end:],
-            ]
-        )
+        status = _run([*before_ros, *arguments[end:]])
         # does nothing where stdout was closed before the start
         print(end="", flush=True)
     except (Exception, KeyboardInterrupt) as error:

@@ -125,32 +125,8 @@ def map_workspace(options: argparse.Namespace) -> None:
 
 def run_simulation(options: argparse.Namespace) -> int:
     """Simulate a scene; write and draw its trajectory."""
-    target, pictures = options.out, list[tuple[Path, str]]()
-    ends = f"must end in {' or '.join(SUFFIXES)}"
-    refuse_unless(
-        "simulate",
-        ("--out", str(target), target is None or target.suffix in SUFFIXES, ends),
-    )
-    written = target is None or target.suffix == ".csv"
-    prints_motion = not options.reactions or (
-        written and (target is not None or options.plot)
-    )
-    refuse_unless(
-        "simulate",
-        ("--reactions", True, prints_motion, "needs --plot, or --out FILE.csv"),
-    )
-    if target is not None:
-        free_out(options, target)
-        if library := {".parquet": "pyarrow", ".csv": "pandas"}.get(target.suffix):
-            require(library)
-    if options.plot:
-        stem = (target or Path(Path(options.scene).name)).with_suffix("")
-        pictures.append((stem.with_name(f"{stem.name}.png"), "motion"))
-        if options.reactions:
-            pictures.append((stem.with_name(f"{stem.name}_reactions.png"), "reactions"))
-        for picture, _ in pictures:
-            require_free(picture, "simulate", force=options.force)
-        require("matplotlib")
+    target = options.out
+    pictures = _check_simulation(options)
     names = ("duration", "method", "tolerance", "samples")
     choices = {name: getattr(options, name) for name in names}
     trajectory = simulate(options.scene, progress=True, **choices)
@@ -158,15 +134,41 @@ def run_simulation(options: argparse.Namespace) -> int:
     if target is not None:
         trajectory.save(target, overwrite=options.force, reactions=options.reactions)
         print(target)
-    for picture, prints_motion in pictures:
-        figure = (
-            trajectory.plot()
-            if prints_motion == "motion"
-            else trajectory.reactions.plot()
-        )
-        function("figures:save_figure")(figure, picture)
+    for subject, picture in pictures.items():
+        drawn = trajectory if subject == "motion" else trajectory.reactions
+        function("figures:save_figure")(drawn.plot(), picture)
         print(picture)
     return 0 if trajectory.success else 1
+
+
+def _check_simulation(options: argparse.Namespace) -> dict[str, Path]:
+    """Refuse what cannot be written; return the pictures to draw, by their subject."""
+    target = options.out
+    ends = f"must end in {' or '.join(SUFFIXES)}"
+    is_file = target is None or target.suffix in SUFFIXES
+    refuse_unless("simulate", ("--out", str(target), is_file, ends))
+    if options.reactions:
+        writes_csv = target is not None and target.suffix == ".csv"
+        draws = options.plot and (target is None or writes_csv)
+        requirement = "needs --plot, or --out FILE.csv"
+        refuse_unless(
+            "simulate", ("--reactions", True, writes_csv or draws, requirement)
+        )
+    if target is not None:
+        free_out(options, target)
+        library = {".parquet": "pyarrow", ".csv": "pandas"}.get(target.suffix)
+        if library:
+            require(library)
+    if not options.plot:
+        return {}
+    stem = (target or Path(Path(options.scene).name)).with_suffix("")
+    pictures = {"motion": stem.with_name(f"{stem.name}.png")}
+    if options.reactions:
+        pictures["reactions"] = stem.with_name(f"{stem.name}_reactions.png")
+    for picture in pictures.values():
+        require_free(picture, "simulate", force=options.force)
+    require("matplotlib")
+    return pictures
 
 
 def certify_scene(options: argparse.Namespace) -> int:
@@ -181,7 +183,8 @@ def certify_scene(options: argparse.Namespace) -> int:
         refuse_unless("certify", ("--range", text, key not in ranges, "names it twice"))
         ranges[key] = width
     choices |= {"ranges": ranges, "split": options.split or 1, "progress": True}
-    scene, torque = load(options.scene), None
+    scene = load(options.scene)
+    torque = None
     loop_options = (
         options.gain,
         options.noise,
