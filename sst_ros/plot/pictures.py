@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.interpolate import CubicHermiteSpline
@@ -104,23 +105,25 @@ def joints(
     """
 
     def draw(run: Signals, _: Scene) -> Figure:
-        seconds, recorded = run.seconds(), TRUE_JOINT_STATES.key not in run.missing
-        figure, panels = stack(
-            [f"{letter} [{unit}]" for letter in letters.values()], 2.6
-        )
+        seconds = run.seconds()
+        labels = [f"{letter} [{unit}]" for letter in letters.values()]
+        figure, panels = stack(labels, 2.6)
         for axes, (name, letter) in zip(panels, letters.items(), strict=True):
-            if recorded:
-                label: str | None = "measured"
-                for column in scale * run.legs(name).T:
-                    axes.plot(
-                        seconds, column, ".", color=GREY, markersize=2, label=label
-                    )
-                    label = None
+            if TRUE_JOINT_STATES.key not in run.missing:
+                _draw_dots(axes, seconds, scale * run.legs(name))
             values = scale * run.true_legs(name)
             figures.lines(axes, seconds, values, leg_names(letter), gaps=run.gaps())
         return figure
 
     return draw
+
+
+def _draw_dots(axes: Axes, seconds: Array, values: Array) -> None:
+    """Draw what was measured, shape (n, 3), with one entry in the legend."""
+    label: str | None = "measured"
+    for column in values.T:
+        axes.plot(seconds, column, ".", color=GREY, markersize=2, label=label)
+        label = None
 
 
 class LegCurves(NamedTuple):
@@ -164,14 +167,14 @@ def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
 
     The paper's figures have their number and name the assumption behind them.
     """
-    title += f", {scene}" if scene else ""
-    number = FIGURE_NUMBERS.get(scene or "", {}).get(name)
+    if scene is None:
+        return name, title
+    title = f"{title}, {scene}"
+    number = FIGURE_NUMBERS.get(scene, {}).get(name)
     if number is None:
         return name, title
-    return (
-        f"fig{number:02d}_{name}",
-        f"{title}\nFig. {number} of the paper; {ASSUMPTION}",
-    )
+    in_paper = f"Fig. {number} of the paper; {ASSUMPTION}"
+    return f"fig{number:02d}_{name}", f"{title}\n{in_paper}"
 
 
 def zyz_degrees(quaternion: Array, place: int) -> Array:
@@ -184,18 +187,20 @@ def zyz_degrees(quaternion: Array, place: int) -> Array:
 
 def _position(run: Signals, scene: Scene) -> Figure:
     """Draw the coordinates of E over time."""
-    values = position_of_e(scene, run.take(*QUATERNION_COLUMNS))
-    panel = Panel(POSITION, "xyz", values)
-    looks: figures.Looks = {"least_span": LEAST_POSITION_M, "gaps": run.gaps()}
-    return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
+    quaternion = run.take(*QUATERNION_COLUMNS)
+    panel = Panel(POSITION, "xyz", position_of_e(scene, quaternion))
+    return figures.draw_panels(
+        run.seconds(), [panel], 3.2, least_span=LEAST_POSITION_M, gaps=run.gaps()
+    )
 
 
 def _angle(run: Signals, _: Scene | None, place: int) -> Figure:
     """Draw one of the ZYZ angles over time."""
     degrees = zyz_degrees(run.take(*QUATERNION_COLUMNS), place)
     panel = Panel(f"{ZYZ[place]} [deg]", ZYZ[place], degrees)
-    looks: figures.Looks = {"least_span": LEAST_ANGLE_DEG, "gaps": run.gaps()}
-    return figures.draw_panels(run.seconds(), [panel], 3.2, **looks)
+    return figures.draw_panels(
+        run.seconds(), [panel], 3.2, least_span=LEAST_ANGLE_DEG, gaps=run.gaps()
+    )
 
 
 def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
@@ -255,19 +260,18 @@ def _path(run: Signals, scene: Scene) -> Figure:
 
 def _tracking(run: Signals, _: Scene) -> Figure:
     """Draw the desired angle of each actuator, and the measured one over it."""
-    below = {"color": GREY, "linewidth": 3.2}
-    above = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
-    desired, measured = (
-        DEGREES * run.legs(name) for name in ("gamma_desired", "gamma")
-    )
+    desired_look = {"color": GREY, "linewidth": 3.2}
+    measured_look = {"color": BLUE, "linewidth": 1.5, "linestyle": "--"}
+    desired = DEGREES * run.legs("gamma_desired")
+    measured = DEGREES * run.legs("gamma")
     series = [
-        LegCurves.of("desired", run, desired, below),
-        LegCurves.of("measured", run, measured, above),
+        LegCurves.of("desired", run, desired, desired_look),
+        LegCurves.of("measured", run, measured, measured_look),
     ]
     if TRUE_JOINT_STATES.key not in run.missing:
-        looks = {"color": VERMILION, "linewidth": 0.9, "linestyle": ":"}
+        true_look = {"color": VERMILION, "linewidth": 0.9, "linestyle": ":"}
         true = DEGREES * run.true_legs("gamma")
-        series.append(LegCurves.of("true", run, true, looks))
+        series.append(LegCurves.of("true", run, true, true_look))
     return draw_legs("γ [deg]", series)
 
 
@@ -315,22 +319,25 @@ def tick_torques(run: Signals) -> tuple[Array, Array]:
     seconds = np.stack([start, end], axis=1).ravel() / NANOSECONDS
     torques = np.repeat(torque, 2, axis=0)
     gaps = 2 * (np.flatnonzero(start[1:] != end[:-1]) + 1)
-    return np.insert(seconds, gaps, seconds[gaps]), np.insert(
-        torques, gaps, np.nan, axis=0
-    )
+    seconds_with_gaps = np.insert(seconds, gaps, seconds[gaps])
+    return seconds_with_gaps, np.insert(torques, gaps, np.nan, axis=0)
 
 
 def energies(run: Signals, scene: Scene) -> tuple[Array, Array]:
-    """Kinetic and potential energy at each sample [J], shape (n,).
+    """Return kinetic and potential energy at each sample [J], shape (n,).
 
     Nan where it was lost.
     """
     quaternion = run.take(*QUATERNION_COLUMNS)
-    rates = [run.true_legs(name) for name in ("gamma_dot", "mu_dot", "beta_dot")]
-    turned = body_rates(Geometry.of(scene), quaternion, *rates)
-    model, state = model_of(scene), (*quaternion.T, *turned.T)
+    gamma_dot = run.true_legs("gamma_dot")
+    mu_dot = run.true_legs("mu_dot")
+    beta_dot = run.true_legs("beta_dot")
+    geometry = Geometry.of(scene)
+    body_rate = body_rates(geometry, quaternion, gamma_dot, mu_dot, beta_dot)
+    model = model_of(scene)
+    state = (*quaternion.T, *body_rate.T)
     kinetic = np.asarray(kinetic_energy(model, state))
-    # a number where it is constant
+    # The potential energy is one number where it is constant.
     return kinetic, potential_energy(model, state) + 0.0 * kinetic
 
 
@@ -385,15 +392,18 @@ def _energy(run: Signals, scene: Scene) -> Figure:
 def _margins(run: Signals, scene: Scene) -> Figure:
     """Draw the distance of each leg to the nearest limit of its joints."""
     geometry = Geometry.of(scene)
-    figure, panels = stack(
-        ["to an end of the stroke [deg]", "to a limit of β [deg]"], 2.6
-    )
-    most = {"gamma": geometry.arc, "beta": geometry.beta_max}
-    for axes, (name, limit) in zip(panels, most.items(), strict=True):
-        angles = run.true_legs(name)
-        left = np.minimum(angles, limit - angles)
-        names = [f"leg {k}" for k in (1, 2, 3)]
-        figures.lines(axes, run.seconds(), DEGREES * left, names, gaps=run.gaps())
+    labels = ["to an end of the stroke [deg]", "to a limit of β [deg]"]
+    figure, panels = stack(labels, 2.6)
+    stroke_axes, beta_axes = panels
+    names = [f"leg {k}" for k in (1, 2, 3)]
+    for axes, angle, limit in (
+        (stroke_axes, "gamma", geometry.arc),
+        (beta_axes, "beta", geometry.beta_max),
+    ):
+        angles = run.true_legs(angle)
+        distance = np.minimum(angles, limit - angles)
+        degrees = DEGREES * distance
+        figures.lines(axes, run.seconds(), degrees, names, gaps=run.gaps())
         axes.axhline(0.0, color="black", linewidth=0.8)
     return figure
 

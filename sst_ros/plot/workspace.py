@@ -173,40 +173,48 @@ def _panel(
     finite = np.isfinite(values)
     inside = finite[faces].all(axis=1)
     if inside.any():
-        goal = float(np.nanmin(values) if condition else np.nanmax(values))
-        levels: Any = (
-            CONDITIONS if condition else MaxNLocator(10).tick_values(0.0, goal)
-        )
-        looks: Looks = {"cmap": "viridis", "levels": levels}
-        if condition:
-            looks |= {
-                "cmap": "magma_r",
-                "norm": LogNorm(1.0, CONDITIONS[-1]),
-                "extend": "max",
-            }
+        best_value = float(np.nanmin(values) if condition else np.nanmax(values))
+        levels: Any = CONDITIONS
+        looks: Looks = {
+            "cmap": "magma_r",
+            "norm": LogNorm(1.0, CONDITIONS[-1]),
+            "extend": "max",
+        }
+        if not condition:
+            levels = MaxNLocator(10).tick_values(0.0, best_value)
+            looks = {"cmap": "viridis"}
         mesh = Triangulation(x, y, faces, mask=~inside)
-        filled = axes.tricontourf(mesh, np.where(finite, values, goal), **looks)
+        shown_values = np.where(finite, values, best_value)
+        filled = axes.tricontourf(mesh, shown_values, levels=levels, **looks)
         bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, ticks=levels)
         bar.set_label("cond J" if condition else "deg", fontsize=9)
         bar.ax.tick_params(labelsize=8)
         bar.ax.set_yticklabels([f"{level:g}" for level in levels])
         bar.ax.minorticks_off()
         # On a plateau the place that is farthest from the limits.
-        plateau = np.abs(values - goal) <= 0.01 * abs(goal)
+        plateau = np.abs(values - best_value) <= 0.01 * abs(best_value)
         best = int(np.nanargmax(np.where(plateau, chart.best_margin, np.nan)))
-        axes.plot(
-            x[best], y[best], "*", markersize=13, color="white", markeredgecolor=INK
-        )
-        text = f"least {goal:.2f}" if condition else f"most {goal:.0f}°"
-        box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
-        beside: Looks = {
-            "textcoords": "offset points",
-            "fontsize": 9,
-            "ha": "center",
-            "bbox": box,
-        }
-        axes.annotate(text, (x[best], y[best]), (0, 8), color=INK, **beside)
+        text = f"most {best_value:.0f}°"
+        if condition:
+            text = f"least {best_value:.2f}"
+        _mark_best(axes, x[best], y[best], text)
     draw_triangle(axes, chart.geometry)
+
+
+def _mark_best(axes: Axes, x: float, y: float, text: str) -> None:
+    """Mark the best place of a map by a star with a text above it."""
+    axes.plot(x, y, "*", markersize=13, color="white", markeredgecolor=INK)
+    box = {"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.75}
+    axes.annotate(
+        text,
+        (x, y),
+        (0, 8),
+        color=INK,
+        textcoords="offset points",
+        fontsize=9,
+        ha="center",
+        bbox=box,
+    )
 
 
 def sides(geometry: Geometry, points: int) -> Array:
