@@ -197,7 +197,7 @@ def _spread_root(solution: _Solution, growth: Array) -> Array:
 
 def find_consistent_values(
     names: Sequence[str],
-    given: Array,
+    start: Array,
     transform: Array,
     estimate: Array,
     root: Array,
@@ -211,9 +211,9 @@ def find_consistent_values(
     Returns the values, shape (p,), and chi^2 of the base parameters there: how much
     worse the torques are fitted than without the constraints.
     """
-    sizes, (constant, basis) = scales(names, given), make_cones(names, reach)
+    sizes, (constant, basis) = scales(names, start), make_cones(names, reach)
     rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
-    right = np.concatenate([root @ estimate, given / sizes])
+    right = np.concatenate([root @ estimate, start / sizes])
     identity = np.tile(np.eye(4), (len(constant), 1, 1)).ravel()
 
     def cost(values: Array, barrier: float) -> float:
@@ -243,7 +243,7 @@ def find_consistent_values(
     lifted = [
         ".moment." not in name and name[-2:] not in ("xy", "xz", "yz") for name in names
     ]
-    values = given + INTERIOR * sizes * lifted
+    values = start + INTERIOR * sizes * lifted
     for barrier in BARRIERS:
         for _ in range(_BARRIER_NEWTON_STEPS):
             inverse = np.linalg.inv(
@@ -259,13 +259,13 @@ def find_consistent_values(
             )
             lengths = np.linalg.norm(matrix, axis=0)
             q, r = np.linalg.qr(matrix / lengths)
-            part = q.T @ target
-            step = solve_triangular(r, part) / lengths
+            rotated = q.T @ target
+            step = solve_triangular(r, rotated) / lengths
             least = float(
                 np.linalg.eigvalsh(np.tensordot(step, slopes, 1)).min(initial=0.0)
             )
             size = 1.0 if least > -_CLOSE else -_CLOSE / least
-            centred = part @ part < CENTRED * barrier
+            centred = rotated @ rotated < CENTRED * barrier
             most = LARGEST_DOUBLE if centred else cost(values, barrier)
             size = shorten(values, step, size, barrier, most)
             values = values + size * step
@@ -285,14 +285,14 @@ def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
     # [[m r 1, h], [h^T, m r]] of m and h.
     centre = [reach * np.eye(4), *_PSEUDO[1:4]]
     for body in dict.fromkeys(name.partition(".")[0] for name in names):
-        parts = [f"{body}.{part}" for part in STANDARD]
-        if set(parts) <= set(names):
+        standard_names = [f"{body}.{entry}" for entry in STANDARD]
+        if set(standard_names) <= set(names):
             cones += (
-                dict(zip(parts, _PSEUDO, strict=True)),
-                dict(zip(parts, centre, strict=False)),
+                dict(zip(standard_names, _PSEUDO, strict=True)),
+                dict(zip(standard_names, centre, strict=False)),
             )
-        elif set(parts[4:]) <= set(names):
-            cones.append(dict(zip(parts[4:], _PSEUDO[4:], strict=True)))
+        elif set(standard_names[4:]) <= set(names):
+            cones.append(dict(zip(standard_names[4:], _PSEUDO[4:], strict=True)))
     cones += [
         {name: np.diag([1.0, 0.0, 0.0, 0.0])}
         for name in names
@@ -306,20 +306,20 @@ def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
     return empty[:, :, None] * np.eye(4), basis
 
 
-def scales(names: Sequence[str], given: Array) -> Array:
+def scales(names: Sequence[str], start: Array) -> Array:
     """Return the sizes that parameters may have, shape (p,).
 
     Those of bodies are by their mass and inertia.
     """
-    values = dict(zip(names, given.tolist(), strict=True))
+    values = dict(zip(names, start.tolist(), strict=True))
     sizes = []
     for name in names:
-        body, _, part = name.partition(".")
+        body, _, entry = name.partition(".")
         trace = sum(
             abs(values.get(f"{body}.inertia.{axis}", 0.0))
             for axis in ("xx", "yy", "zz")
         )
         mass = abs(values.get(f"{body}.mass", 0.0)) or 1.0
         of_body = {"mass": mass, "moment": np.sqrt(mass * trace), "inertia": trace}
-        sizes.append(of_body.get(part.partition(".")[0], abs(values[name])) or 1.0)
+        sizes.append(of_body.get(entry.partition(".")[0], abs(values[name])) or 1.0)
     return np.array(sizes, dtype=float)

@@ -75,9 +75,9 @@ def check_angles(motion: MeasuredMotion) -> list[str]:
     travel = np.ptp(motion.gamma, axis=0)
     leg = int(np.argmax(travel))
     if travel[leg] > MOST_TRAVEL:
-        allowed = f"must be less than {MOST_TRAVEL:.3g} rad: angles are in radians"
+        requirement = f"must be less than {MOST_TRAVEL:.3g} rad: angles are in radians"
         key = f"range of gamma_{leg + 1}"
-        raise refusal("identify", key, float(travel[leg]), allowed)
+        raise refusal("identify", key, float(travel[leg]), requirement)
     _refuse_jumps(motion)
     if motion.gamma_dot is not None:
         _refuse_other_rates(motion, motion.gamma_dot)
@@ -105,12 +105,12 @@ def _refuse_jumps(motion: MeasuredMotion) -> None:
     jumps = np.argwhere((np.abs(steps) > JUMP) & (rates > ABRUPT * usual))
     if len(jumps):
         row, leg = jumps[0].tolist()
-        allowed = (
+        requirement = (
             f"jumps by {steps[row, leg]:+.3f} rad at row {row + 1}, between samples "
             "that move slowly: must be without faults of the encoder"
         )
         angle = float(motion.gamma[row + 1, leg])
-        raise refusal("identify", f"gamma_{leg + 1}", angle, allowed)
+        raise refusal("identify", f"gamma_{leg + 1}", angle, requirement)
 
 
 def _refuse_other_rates(motion: MeasuredMotion, rates: Array) -> None:
@@ -128,15 +128,15 @@ def _refuse_other_rates(motion: MeasuredMotion, rates: Array) -> None:
             max(range_by_rates, range_by_angles) > LEAST_TRAVEL
             and off > RATE_SHARE * size
         ):
-            allowed = (
+            requirement = (
                 f"must be that of gamma_{k + 1}, {range_by_angles:.3g} rad, and alike: "
                 "rates are in rad/s, times in s"
             )
             key = f"range of the integral of gamma_dot_{k + 1}"
-            raise refusal("identify", key, range_by_rates, allowed)
+            raise refusal("identify", key, range_by_rates, requirement)
 
 
-def check_energy(found: float, deviation: float, expected: float) -> list[str]:
+def check_energy(energy: float, deviation: float, expected: float) -> list[str]:
     """Compare the kinetic energy [J] by the estimates with that of the given scene.
 
     Returns a note where they are far apart. Raises InputError where the energy is
@@ -144,18 +144,18 @@ def check_energy(found: float, deviation: float, expected: float) -> list[str]:
     """
     if expected <= 0.0:
         return []
-    most = found + CERTAIN * deviation
+    most = energy + CERTAIN * deviation
     if most < -LEAST_ENERGY * expected:
-        allowed = (
+        requirement = (
             "must be > 0 J: the torques give bodies of negative inertia, so that the "
             "signs of torque and gamma contradict each other"
         )
-        raise refusal("identify", "mean kinetic energy", found, allowed)
-    least = found - CERTAIN * deviation
-    ratio = found / expected
+        raise refusal("identify", "mean kinetic energy", energy, requirement)
+    least = energy - CERTAIN * deviation
+    ratio = energy / expected
     if least > IMPOSSIBLE * expected or most < expected / IMPOSSIBLE:
-        allowed = "must be about 1: t is in s, torque in N m"
-        raise refusal("identify", "inertia over that of the scene", ratio, allowed)
+        requirement = "must be about 1: t is in s, torque in N m"
+        raise refusal("identify", "inertia over that of the scene", ratio, requirement)
     if least > STRANGE * expected or most < expected / STRANGE:
         return [
             f"bodies have {ratio:.2g} times the inertia of the scene: is t in s, and "

@@ -154,8 +154,8 @@ class _Trial:
     ) -> None:
         self._regressor = Regressor(scene, names)
         self.base = find_base_parameters(self._regressor)
-        allowed = "must determine something: no torque depends on these parameters"
-        found = "parameters", list(names), bool(self.base.chosen), allowed
+        requirement = "must determine something: no torque depends on these parameters"
+        found = "parameters", list(names), bool(self.base.chosen), requirement
         refuse_unless("identify design", found)
         self._scene, self._values = scene, parameters.values(scene, names)
         self._space = ActuatorSpaceMap(Geometry.of(scene))
@@ -168,13 +168,17 @@ class _Trial:
         )
         n = np.arange(1, harmonics + 1)
         # gamma, gamma_dot, gamma_ddot at the beginning
-        rest = np.zeros((3, 2 * harmonics))
-        rest[0, harmonics:], rest[1, :harmonics], rest[2, harmonics:] = 1.0, n, n * n
-        basis, w = null_space(rest), 2.0 * np.pi * n / duration
+        at_rest = np.zeros((3, 2 * harmonics))
+        at_rest[0, harmonics:], at_rest[1, :harmonics], at_rest[2, harmonics:] = (
+            1.0,
+            n,
+            n * n,
+        )
+        basis, w = null_space(at_rest), 2.0 * np.pi * n / duration
         self.size = 3 * basis.shape[1]
         s, c = (f(np.outer(self.times, w)) for f in (np.sin, np.cos))
         derivatives = ([s, c], [c * w, -s * w], [-s * w * w, -c * w * w])
-        self._maps = [np.hstack(parts) @ basis for parts in derivatives]
+        self._maps = [np.hstack(harmonics_of) @ basis for harmonics_of in derivatives]
 
     def series(self, free: Array) -> tuple[Array, Array, Array]:
         """Angles [rad] and two derivatives at the samples, each shape (n, 3)."""

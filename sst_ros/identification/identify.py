@@ -247,7 +247,9 @@ def _check_request(
     delay: float | None,
 ) -> None:
     """Refuse a motion at rest, no parameters, and a noise or delay that none has."""
-    travel = max(float(np.ptp(part.gamma, axis=0).max()) for part in segments.parts)
+    travel = max(
+        float(np.ptp(segment.gamma, axis=0).max()) for segment in segments.parts
+    )
     moves = travel >= STILL or scene.gravity is not None
     weights = finite_vector(noise)
     positive = noise is None or (weights is not None and min(weights) > 0.0)

@@ -116,25 +116,25 @@ def read_motion(data: Measured) -> MeasuredMotion:
 
 def read_segments(data: Measured) -> Segments:
     """Read a motion as `read_motion`, cut where samples or torques are lost."""
-    motion, known, turns = _read(data)
+    motion, is_known, turns = _read(data)
     notes = [turns] if turns else []
     spacing = np.diff(motion.t)
-    cuts = np.flatnonzero((spacing > GAP * np.median(spacing)) | ~known)
+    cuts = np.flatnonzero((spacing > GAP * np.median(spacing)) | ~is_known)
     bounds = [0, *(cuts + 1).tolist(), len(motion.t)]
     spans = [(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST]
     if len(cuts):
         lost = ", ".join(
             f"{t:g} s" for t in (motion.t[cuts] - motion.t[0]).tolist()[:5]
         )
-        more = ", ..." if len(cuts) > 5 else ""
+        ellipsis = ", ..." if len(cuts) > 5 else ""
         text = (
-            f"samples or torques are lost after {lost}{more}: {len(spans)} segments are"
-            " fitted"
+            f"samples or torques are lost after {lost}{ellipsis}: {len(spans)} segments"
+            " are fitted"
         )
         notes.append(text)
     if not spans:
-        allowed = f"must have {FEWEST} samples or more without a gap"
-        raise refusal("identify", "t", len(motion.t), allowed)
+        requirement = f"must have {FEWEST} samples or more without a gap"
+        raise refusal("identify", "t", len(motion.t), requirement)
     return Segments(
         motion, tuple(_cut(motion, first, end) for first, end in spans), tuple(notes)
     )
@@ -173,26 +173,26 @@ def _read(data: Measured) -> tuple[MeasuredMotion, Known, str]:
 
     Say of each interval whether its torque is known, and what was unwrapped.
     """
-    given: dict[str, Any]
-    known: Known | None
+    arrays: dict[str, Any]
+    is_known: Known | None
     if isinstance(data, Mapping):
-        given, known = dict(data), None
+        arrays, is_known = dict(data), None
     else:
-        given, known = _take_samples(data)
-    given = {name: value for name, value in given.items() if value is not None}
-    motion = build(MeasuredMotion, given, "identify")
-    if known is None:
-        known = np.full(len(motion.t) - 1, True)
+        arrays, is_known = _take_samples(data)
+    arrays = {name: value for name, value in arrays.items() if value is not None}
+    motion = build(MeasuredMotion, arrays, "identify")
+    if is_known is None:
+        is_known = np.full(len(motion.t) - 1, True)
     jumps = np.argwhere(np.abs(np.diff(motion.gamma, axis=0)) > np.pi)
     if not len(jumps):
-        return motion, known, ""
+        return motion, is_known, ""
     row, leg = jumps[0].tolist()
     step = float(motion.gamma[row + 1, leg] - motion.gamma[row, leg])
     text = (
         f"angles wrap {len(jumps)} times, gamma_{leg + 1} first by {step:+.3f} rad at"
         f" row {row + 1}: whole turns are taken out"
     )
-    return replace(motion, gamma=np.unwrap(motion.gamma, axis=0)), known, text
+    return replace(motion, gamma=np.unwrap(motion.gamma, axis=0)), is_known, text
 
 
 def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
@@ -217,10 +217,10 @@ def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
     if not isinstance(data, Trajectory) and hasattr(data, "measured"):
         return _take_measured(data)
     if not isinstance(data, Trajectory):
-        allowed = (
+        requirement = (
             "must be a recording or its path, a Trajectory, or a mapping of arrays"
         )
-        raise refusal("identify", "data", data, allowed)
+        raise refusal("identify", "data", data, requirement)
     motion, law = data, data.law
     t, torque = motion.t, motion.torque
     # With a lag the torques at the joints are behind those of the law: they are
@@ -256,10 +256,15 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
         )
         quaternions = motion.quaternion
     else:
-        shown = run.measured
-        t, gamma, rates, effort = shown.time_ns / 1e9, shown.gamma, None, shown.effort
-        at = np.searchsorted(run.time_ns[:-1], shown.time_ns)
-        passive, quaternions = (shown.mu, shown.beta), run.quaternion[at]
+        sensed = run.measured
+        t, gamma, rates, effort = (
+            sensed.time_ns / 1e9,
+            sensed.gamma,
+            None,
+            sensed.effort,
+        )
+        nearest = np.searchsorted(run.time_ns[:-1], sensed.time_ns)
+        passive, quaternions = (sensed.mu, sensed.beta), run.quaternion[nearest]
     ticks = run.ticks
     begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
     rows = (t >= begins[0] - 1e-12) & (t <= ends[-1] + 1e-12)
@@ -271,11 +276,11 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     edges = np.stack([begins, ends], axis=1).ravel()
     lengths = np.stack([ends - begins, np.zeros(len(begins))], axis=1).ravel()
     so_far = np.append(0.0, np.cumsum(lengths))[:-1]
-    known = np.diff(np.interp(t, edges, so_far)) > np.diff(t) - 1e-9
+    is_known = np.diff(np.interp(t, edges, so_far)) > np.diff(t) - 1e-9
     quaternion = next(iter(quaternions[rows]), None)
     if quaternion is not None and not np.isfinite(quaternion).all():
         quaternion = None
-    mu, beta = (None if one is None else one[rows] for one in passive)
+    mu, beta = (None if angles is None else angles[rows] for angles in passive)
     return {
         "t": t,
         "gamma": np.unwrap(gamma[rows], axis=0),
@@ -285,7 +290,7 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
         "mu": mu,
         "beta": beta,
         "held": held,
-    }, known
+    }, is_known
 
 
 def _average(law: torques.TorqueProfile, t: Array) -> Array:

@@ -169,10 +169,10 @@ class MeasuredPath:
         inside = (late_times >= self.times[0, 0]) & (late_times <= self.times[-1, -1])
         angles, rates, _ = self._at(late_times[inside][::step])
         quaternion = _follow_orientations(self._space, angles, self.measured)
-        rest = np.zeros((len(angles), 3))
-        star = self._star_accelerations(quaternion, rest, rates)
-        moved_known, moved_columns = regressor(quaternion, rest, star[:, 3:])
-        held_known, held_columns = regressor(quaternion, rest, rest)
+        zeros = np.zeros((len(angles), 3))
+        star = self._star_accelerations(quaternion, zeros, rates)
+        moved_known, moved_columns = regressor(quaternion, zeros, star[:, 3:])
+        held_known, held_columns = regressor(quaternion, zeros, zeros)
         known = moved_known - held_known
         columns = moved_columns - held_columns
         return EnergySums(
@@ -224,14 +224,14 @@ def _check_passive(
     What is measured need not close the loops: APART is what no sensor is off, but
     another assembly.
     """
-    shown = {"mu": measured.mu, "beta": measured.beta}
-    if all(angles is None for angles in shown.values()):
+    passive = {"mu": measured.mu, "beta": measured.beta}
+    if all(angles is None for angles in passive.values()):
         return
     quaternion = _follow_orientations(space, measured.gamma, measured)
     at_rest = *quaternion.T, *np.zeros((3, len(quaternion)))
     of_gamma = joints(model_of(scene), at_rest)
     requirement = f"must be within {APART:g} rad of those that gamma has in this scene"
-    for name, angles in shown.items():
+    for name, angles in passive.items():
         if angles is None:
             continue
         turns = np.exp(1j * (angles - np.stack(getattr(of_gamma, name), axis=1)))
@@ -260,11 +260,11 @@ def _follow_orientations(
         start = None
         if measured.quaternion is not None:
             rotation = rotation_matrix(np.array(measured.quaternion))
-            shown = kinematics.inverse(space.geometry, rotation)[0]
-            off = np.angle(np.exp(1j * (first[0] - shown)))
+            angles = kinematics.inverse(space.geometry, rotation)[0]
+            off = np.angle(np.exp(1j * (first[0] - angles)))
             if not np.abs(off).max() <= NEAR:
                 raise refusal("identify", *fault)
-            start = continuation.advance(space.geometry, rotation, shown, shown + off)
+            start = continuation.advance(space.geometry, rotation, angles, angles + off)
         coarse, _ = continuation.follow(space.geometry, points, start)
     nearest = np.searchsorted(knots, np.arange(len(gamma)), side="right")
     return space.orientations(quaternion_of(coarse)[nearest], gamma)

@@ -68,27 +68,27 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
     A name counts that begins as in ("star", "friction.gamma", "offset"); a beginning of
     none is refused.
     """
-    own, others = _list_names(scene)
+    own, optional = _list_names(scene)
     if requested is None:
         return tuple(own)
     names: dict[str, None] = {}
-    checks, known = list[Check](), dict.fromkeys(own + others)
+    checks, selectable = list[Check](), dict.fromkeys(own + optional)
     for begin in [requested] if isinstance(requested, str) else requested:
-        found = [
+        matches = [
             name
-            for name in known
+            for name in selectable
             if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)
         ]
         if str(begin) in LINKS:  # the three alike
-            found = [name for name in found if "[" not in name]
-        near = "" if found else suggestion(str(begin), known)
-        allowed = f"begins no parameter of the scene{near}"
-        checks.append(("parameters", begin, bool(found), allowed))
-        names |= dict.fromkeys(found)
-    for kind in LINKS:
-        both = {name.removeprefix(kind)[:1] for name in names if name.startswith(kind)}
-        allowed = f"name {kind} alike, or {kind}[0] to {kind}[2], not both"
-        checks.append(("parameters", kind, len(both) <= 1, allowed))
+            matches = [name for name in matches if "[" not in name]
+        hint = "" if matches else suggestion(str(begin), selectable)
+        requirement = f"begins no parameter of the scene{hint}"
+        checks.append(("parameters", begin, bool(matches), requirement))
+        names |= dict.fromkeys(matches)
+    for link in LINKS:
+        forms = {name.removeprefix(link)[:1] for name in names if name.startswith(link)}
+        requirement = f"name {link} alike, or {link}[0] to {link}[2], not both"
+        checks.append(("parameters", link, len(forms) <= 1, requirement))
     refuse_unless("identify", *checks)
     return tuple(names)
 
@@ -98,12 +98,12 @@ def values(scene: Scene, names: Sequence[str]) -> Array:
 
     A value is zero for what the scene does not have.
     """
-    found = []
+    numbers = []
     for name in names:
         body, moment, _ = name.partition(".moment.")
         mass = (find_number(scene, f"{body}.mass") or 0.0) if moment else 1.0
-        found.append(mass * (find_number(scene, _of_centre(name)) or 0.0))
-    return np.array(found)
+        numbers.append(mass * (find_number(scene, _of_centre(name)) or 0.0))
+    return np.array(numbers)
 
 
 def _of_centre(name: str) -> str:
@@ -118,13 +118,13 @@ def with_parameters(
 
     A note of their provenance is added.
     """
-    found = dict(zip(names, (float(number) for number in numbers), strict=True))
+    by_name = dict(zip(names, (float(number) for number in numbers), strict=True))
     changed: dict[str, Any] = {}
-    for name, number in found.items():
-        body, _, part = name.partition(".")
-        if part.startswith("moment."):
-            mass = found.get(f"{body}.mass", find_number(scene, f"{body}.mass"))
-            centre = [found.get(f"{body}.moment.{axis}", 0.0) for axis in "xyz"]
+    for name, number in by_name.items():
+        body, _, entry = name.partition(".")
+        if entry.startswith("moment."):
+            mass = by_name.get(f"{body}.mass", find_number(scene, f"{body}.mass"))
+            centre = [by_name.get(f"{body}.moment.{axis}", 0.0) for axis in "xyz"]
             changed[f"{body}.centre"] = (
                 [h / mass for h in centre] if mass else [0.0] * 3
             )
@@ -136,8 +136,8 @@ def with_parameters(
             if terms.get(key, 0.0) < NEGLIGIBLE:
                 terms[key] = 0.0
     notes = document.setdefault("provenance", {})
-    known = {re.sub(r"\[\d\]", "", name).split(".")[0] for name in found}
-    notes |= dict.fromkeys(sorted(known & document.keys()), note)
+    sections = {re.sub(r"\[\d\]", "", name).split(".")[0] for name in by_name}
+    notes |= dict.fromkeys(sorted(sections & document.keys()), note)
     return build(Scene, drop_idle(Scene, document), scene.name)
 
 
@@ -147,32 +147,32 @@ def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
     Equal links are named alike. What may be asked for besides are links alone or alike,
     friction that is not yet known, and offsets.
     """
-    parts = STANDARD if scene.gravity is not None else STANDARD[4:]
+    entries = STANDARD if scene.gravity is not None else STANDARD[4:]
 
     def name_parts(*bodies: str) -> list[str]:
         massive = (body for body in bodies if values_at(scene, f"{body}.inertia"))
-        return [f"{body}.{part}" for body in massive for part in parts]
+        return [f"{body}.{entry}" for body in massive for entry in entries]
 
-    own, others = name_parts("star"), list[str]()
-    for kind in LINKS:
+    own, optional = name_parts("star"), list[str]()
+    for link in LINKS:
         each, alike = (
-            name_parts(*(f"{kind}[{k}]" for k in range(3))),
-            name_parts(f"{kind}[0]"),
+            name_parts(*(f"{link}[{k}]" for k in range(3))),
+            name_parts(f"{link}[0]"),
         )
         alike = [name.replace("[0]", "") for name in alike]
-        first, *rest = values_at(scene, kind)[0]
-        own += alike if rest == [first, first] else each
-        others += each + alike
+        first, *following = values_at(scene, link)[0]
+        own += alike if following == [first, first] else each
+        optional += each + alike
     terms = [
-        f"friction.{kind}.{part}" for kind in JOINT_KINDS for part in Friction.EFFECTS
+        f"friction.{link}.{entry}" for link in JOINT_KINDS for entry in Friction.EFFECTS
     ]
     springs = [f"springs[{i}].stiffness" for i in range(len(scene.springs))]
     own += filter(
         partial(find_number, scene), [*terms, *springs, "actuators.rotor_inertia"]
     )
-    others += (name for name in terms if not name.endswith("static"))
+    optional += (name for name in terms if not name.endswith("static"))
     return own, [
-        *others,
+        *optional,
         "actuators.rotor_inertia",
         *(f"offset[{k}]" for k in range(3)),
     ]
@@ -246,7 +246,9 @@ class Regressor:
             document["star"],
             *(link for kind in LINKS for link in document[kind]),
         ):
-            body["centre"] = [body["mass"] * part for part in body["centre"]]
+            body["centre"] = [
+                body["mass"] * coordinate for coordinate in body["centre"]
+            ]
             body["mass"] = 1.0
 
         def torques(*inputs: Any) -> tuple[Any, ...]:
@@ -277,9 +279,9 @@ class Regressor:
         """
         count = len(quaternion)
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.
-        at = self._springs[self._traced].astype(float)
-        found = self._torques(*quaternion.T, *rate.T, *acceleration.T, *at)
-        rows = np.stack([np.broadcast_to(row, (count,)) for row in found]).reshape(
+        stiffness = self._springs[self._traced].astype(float)
+        outputs = self._torques(*quaternion.T, *rate.T, *acceleration.T, *stiffness)
+        rows = np.stack([np.broadcast_to(row, (count,)) for row in outputs]).reshape(
             -1, 3, count
         )
         columns = np.zeros((count, 3, len(self.names)))
@@ -313,15 +315,15 @@ def find_base_parameters(regressor: Regressor, seed: int = 0) -> BaseParameters:
     accelerations.
     """
     geometry, rng = Geometry.of(regressor.scene), np.random.default_rng(seed)
-    found = kinematics.direct_many(
+    poses = kinematics.direct_many(
         geometry, rng.uniform(0.1, 0.9, (300, 3)) * geometry.arc
     )
     regular = (
-        found.admissible
-        & (np.abs(found.det_j2) > 0.05)
-        & np.all(np.sin(found.mu) > 0.1, 1)
+        poses.admissible
+        & (np.abs(poses.det_j2) > 0.05)
+        & np.all(np.sin(poses.mu) > 0.1, 1)
     )
-    quaternion = quaternion_of(found.rotation[regular])
+    quaternion = quaternion_of(poses.rotation[regular])
     rate, acceleration = rng.normal(size=(2, len(quaternion), 3)) * [[[2.0]], [[20.0]]]
     return find_independent(
         regressor(quaternion, rate, acceleration)[1], regressor.names
@@ -332,10 +334,10 @@ def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
     """Return the base parameters of a regressor, shape (n, 3, p)."""
     matrix: Any = np.linalg.qr(columns.reshape(-1, columns.shape[-1]), mode="r")
     lengths = np.linalg.norm(matrix, axis=0)
-    there = np.flatnonzero(lengths > ROUNDED * lengths.max(initial=1e-300))
-    scaled = matrix[:, there] / lengths[there]
+    nonzero = np.flatnonzero(lengths > ROUNDED * lengths.max(initial=1e-300))
+    scaled = matrix[:, nonzero] / lengths[nonzero]
     chosen: list[int] = []
-    for i in range(len(there)):
+    for i in range(len(nonzero)):
         trial = [*chosen, i]
         # The last diagonal entry of R is the distance from the span of the columns
         # before.
@@ -345,11 +347,15 @@ def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
     solved = np.linalg.lstsq(scaled[:, chosen], scaled, rcond=None)[0]
     solved[np.abs(solved) < ROUNDED] = 0.0
     transform = np.zeros((len(chosen), len(names)))
-    transform[:, there] = solved * lengths[there] / lengths[there[chosen]][:, None]
-    indices: list[int] = there[chosen].tolist()
+    transform[:, nonzero] = (
+        solved * lengths[nonzero] / lengths[nonzero[chosen]][:, None]
+    )
+    indices: list[int] = nonzero[chosen].tolist()
     labels = [names[i] for i in indices]
     for (row, i), factor in np.ndenumerate(transform):
         if factor and i != indices[row]:
-            shown = "" if abs(abs(factor) - 1.0) <= ROUNDED else f"{abs(factor):.4g} "
-            labels[row] += f" {'-' if factor < 0.0 else '+'} {shown}{names[i]}"
+            coefficient = (
+                "" if abs(abs(factor) - 1.0) <= ROUNDED else f"{abs(factor):.4g} "
+            )
+            labels[row] += f" {'-' if factor < 0.0 else '+'} {coefficient}{names[i]}"
     return BaseParameters(tuple(labels), indices, transform)

@@ -142,9 +142,9 @@ class RegressionEquations:
             contradictions.CERTAIN * deviation, LATE * self._period
         ):
             return []
-        word = "late" if late.delay > 0.0 else "early"
+        direction = "late" if late.delay > 0.0 else "early"
         return [
-            f"angles seem to be {word} against the torques, by some "
+            f"angles seem to be {direction} against the torques, by some "
             f"{1e3 * abs(late.delay):.2g} ms: give the delay, or leave out gamma_dot, "
             "so that it is estimated"
         ]

@@ -165,8 +165,8 @@ class Bag:
         with tempfile.TemporaryDirectory() as folder:
             for path in files:
                 try:
-                    file, kind = _prepare(path, Path(folder))
-                    read = self._read_mcap if kind == "mcap" else self._read_database
+                    file, storage = _prepare(path, Path(folder))
+                    read = self._read_mcap if storage == "mcap" else self._read_database
                     for name, message_type, received_ns, data in read(
                         file, Path(folder)
                     ):
@@ -205,14 +205,15 @@ class Bag:
         files, counts = list[Path](), dict[str, int]()
         text = self.path / "metadata.yaml"
         try:
-            found = read_values(read_file(text), "metadata.yaml")
-            found = found["rosbag2_bagfile_information"]
+            metadata = read_values(read_file(text), "metadata.yaml")
+            metadata = metadata["rosbag2_bagfile_information"]
             files = [
-                self.path / PurePath(name).name for name in found["relative_file_paths"]
+                self.path / PurePath(name).name
+                for name in metadata["relative_file_paths"]
             ]
-            for one in found.get("topics_with_message_count") or ():
-                name = str(one["topic_metadata"]["name"])
-                counts[name] = counts.get(name, 0) + int(one["message_count"])
+            for counted in metadata.get("topics_with_message_count") or ():
+                name = str(counted["topic_metadata"]["name"])
+                counts[name] = counts.get(name, 0) + int(counted["message_count"])
         except (
             OSError,
             ValueError,
@@ -235,17 +236,19 @@ class Bag:
 
         They are in the order of their numbers.
         """
-        parts = [
+        matches = [
             (match, path) for path in self.path.iterdir() if (match := _name(path))
         ]
-        kinds = {(match[1], match[3]) for match, _ in parts}
-        if len(kinds) > 1:
-            names = ", ".join(sorted(path.name for _, path in parts))
-            allowed = (
+        recordings = {(match[1], match[3]) for match, _ in matches}
+        if len(recordings) > 1:
+            names = ", ".join(sorted(path.name for _, path in matches))
+            requirement = (
                 "are files of several recordings, without metadata.yaml: name one file"
             )
-            raise refusal(self.path, "bag", names, allowed)
-        return [path for _, path in sorted(parts, key=lambda one: int(one[0][2] or 0))]
+            raise refusal(self.path, "bag", names, requirement)
+        return [
+            path for _, path in sorted(matches, key=lambda pair: int(pair[0][2] or 0))
+        ]
 
     def _read_mcap(self, path: Path, _: Path) -> Iterator[RawMessage]:
         file = McapFile(path)
@@ -265,15 +268,15 @@ class Bag:
         """
         count = 0
         beside = [path.with_name(path.name + ending) for ending in _UNFINISHED]
-        unfinished = [one for one in beside if one.exists() and one.stat().st_size]
+        unfinished = [file for file in beside if file.exists() and file.stat().st_size]
         try:
             # Not written to, nor is a journal made beside it.
             address = f"{path.absolute().as_uri()}?immutable=1"
             if unfinished:  # SQLite brings a copy to its last whole state
                 own = folder / "unfinished"
                 own.mkdir(exist_ok=True)
-                for one in (path, *unfinished):
-                    shutil.copyfile(one, own / one.name)
+                for file in (path, *unfinished):
+                    shutil.copyfile(file, own / file.name)
                 address = (own / path.name).absolute().as_uri()
             with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
                 topics = database.execute("SELECT id, name, type FROM topics")
@@ -315,12 +318,12 @@ class Bag:
             if sqlite
             else "python -m sst_ros recover BAG"
         )
-        allowed = (
+        requirement = (
             "must be a whole rosbag2 recording, MCAP or sqlite3; "
             f"reading failed{where}: {_one_line(reason)}; "
             f"{by} makes a whole one of what is intact{advice}"
         )
-        return refusal(self.path, "bag", self.path.name, allowed)
+        return refusal(self.path, "bag", self.path.name, requirement)
 
 
 _READ_DAMAGED = ", --damaged reads it here"
@@ -353,11 +356,12 @@ class McapFile:
     def describe(self) -> list[str]:
         """Name what is damaged or lost, a line for each part; none of a whole file."""
         lines = []
-        for one in self.damage:
-            line = f"{self.path.name}, byte {one.offset}: {one.reason}"
-            if one.end_ns:  # seconds after the first message
+        for damage in self.damage:
+            line = f"{self.path.name}, byte {damage.offset}: {damage.reason}"
+            if damage.end_ns:  # seconds after the first message
                 first, last = (
-                    (ns - self._origin_ns) / 1e9 for ns in (one.begin_ns, one.end_ns)
+                    (ns - self._origin_ns) / 1e9
+                    for ns in (damage.begin_ns, damage.end_ns)
                 )
                 line += f" ({first:.3f} s to {last:.3f} s)"
             lines.append(line)
@@ -376,10 +380,12 @@ class McapFile:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.damage.append(Damage(0, "the magic bytes of MCAP are missing"))
             index, data_end = self._read_index(file)
-            chunks = [one for one in index if isinstance(one, ChunkIndex)]
-            chunks.sort(key=lambda one: one.chunk_start_offset)
+            chunks = [entry for entry in index if isinstance(entry, ChunkIndex)]
+            chunks.sort(key=lambda entry: entry.chunk_start_offset)
             # Only an index whose checksum is right says how many there were.
-            written = [one for one in index if isinstance(one, records.Statistics)]
+            written = [
+                entry for entry in index if isinstance(entry, records.Statistics)
+            ]
             if not chunks:
                 yield from self._take(itertools.chain(index, self._read_on(file)))
             else:
@@ -392,8 +398,8 @@ class McapFile:
                 sound = not self.damage
             else:
                 sound = bool(index)
-            whole = written and self.count >= written[0].message_count
-            if chunks and sound and not whole:
+            is_whole = written and self.count >= written[0].message_count
+            if chunks and sound and not is_whole:
                 yield from self._take(self._read_gaps(file, outside, _MESSAGES))
         if written:
             self.lost = max(0, written[0].message_count - self.count)
@@ -415,7 +421,7 @@ class McapFile:
                     self.damage.append(Damage(0, reason))
 
     def _read_gaps(
-        self, file: IO[bytes], gaps: Sequence[tuple[int, int]], kinds: Collection[int]
+        self, file: IO[bytes], gaps: Sequence[tuple[int, int]], opcodes: Collection[int]
     ) -> Iterator[McapRecord]:
         """Yield the records of some kinds that lie between chunks.
 
@@ -425,13 +431,13 @@ class McapFile:
             place = begin
             while place < end:
                 file.seek(place)
-                kind, length = _HEAD.unpack(file.read(_HEAD.size))
+                opcode, length = _HEAD.unpack(file.read(_HEAD.size))
                 behind = place + _HEAD.size + length
                 if behind > end:
-                    found = Damage(place, "unreadable bytes between chunks")
-                    self.damage += [] if found in self.damage else [found]
+                    damage = Damage(place, "unreadable bytes between chunks")
+                    self.damage += [] if damage in self.damage else [damage]
                     break
-                if kind in kinds:
+                if opcode in opcodes:
                     file.seek(place)
                     yield from self._parse(file.read(behind - place), place)
                 place = behind
@@ -471,8 +477,11 @@ class McapFile:
             ):
                 raise ValueError("index with wrong checksum")
             index = list(_records(content))
-            chunks = [one for one in index if isinstance(one, ChunkIndex)]
-            if any(one.chunk_start_offset + one.chunk_length > begin for one in chunks):
+            chunks = [chunk for chunk in index if isinstance(chunk, ChunkIndex)]
+            if any(
+                chunk.chunk_start_offset + chunk.chunk_length > begin
+                for chunk in chunks
+            ):
                 raise ValueError("index with wrong position")
             return index, begin
         except Exception as error:  # mcap raises anything on bad bytes
@@ -483,10 +492,10 @@ class McapFile:
         self, file: IO[bytes], chunks: Sequence[ChunkIndex]
     ) -> Iterator[McapRecord]:
         """Yield the records in each chunk, where the index says that it begins."""
-        for one in chunks:
-            begin = file.seek(one.chunk_start_offset)
-            stored = _records(file.read(one.chunk_length), chunks=True)
-            place = Damage(begin, "", one.message_start_time, one.message_end_time)
+        for chunk in chunks:
+            begin = file.seek(chunk.chunk_start_offset)
+            stored = _records(file.read(chunk.chunk_length), chunks=True)
+            place = Damage(begin, "", chunk.message_start_time, chunk.message_end_time)
             yield from self._open(stored, place)
 
     def _read_on(self, file: IO[bytes]) -> Iterator[McapRecord]:
@@ -526,14 +535,14 @@ class McapFile:
             chunk = next(stored)
             if not isinstance(chunk, Chunk):
                 raise ValueError("no chunk where the index has one")
-            found = breakup_chunk(chunk, validate_crc=True)
+            opened = breakup_chunk(chunk, validate_crc=True)
         except Exception as error:  # mcap raises anything on bad bytes
             wrong = isinstance(error, CRCValidationError)
             place.reason = "chunk with wrong checksum" if wrong else _one_line(error)
             self.damage.append(place)
             return ()
         self.unverified += not chunk.uncompressed_crc
-        return found
+        return opened
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
         """Check the data section, which ends at `end`.
@@ -541,8 +550,8 @@ class McapFile:
         What lies between its chunks is checked, too.
         """
         begin, checksum, record = end - _DATA_END_SIZE, file.seek(0), None
-        while piece := file.read(min(_PIECE, begin - file.tell())):
-            checksum = zlib.crc32(piece, checksum)
+        while block := file.read(min(_PIECE, begin - file.tell())):
+            checksum = zlib.crc32(block, checksum)
         with contextlib.suppress(Exception):  # mcap raises anything on bad bytes
             record = next(_records(file))
         if not isinstance(record, records.DataEnd) or file.tell() != end:
@@ -578,9 +587,11 @@ def _gaps(chunks: Sequence[ChunkIndex], end: int) -> Iterator[tuple[int, int]]:
     These are the parts of the data section that are no chunk or its index.
     """
     begin = len(MCAP0_MAGIC)
-    for one in chunks:
-        yield begin, one.chunk_start_offset
-        begin = one.chunk_start_offset + one.chunk_length + one.message_index_length
+    for chunk in chunks:
+        yield begin, chunk.chunk_start_offset
+        begin = (
+            chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        )
     yield begin, end - _DATA_END_SIZE
 
 
@@ -596,8 +607,8 @@ def _prepare(path: Path, folder: Path) -> tuple[Path, str]:
     """
     if _magic(path) == _ZSTD_MAGIC:
         target = folder / path.name.removesuffix(".zstd")
-        with path.open("rb") as source, target.open("wb") as whole:
-            zstandard.ZstdDecompressor().copy_stream(source, whole)
+        with path.open("rb") as source, target.open("wb") as decompressed:
+            zstandard.ZstdDecompressor().copy_stream(source, decompressed)
         path = target
     with path.open("rb") as file:
         begin = file.read(len(_SQLITE_MAGIC))

@@ -182,14 +182,14 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     connections: dict[tuple[str, str], Connection] = {}
     unknown = 0
     with refuse_errors(str(path), "bag", str(files[0]), "must be readable", OSError):
-        for topic, kind, received_ns, data in file.messages():
+        for topic, encoding, received_ns, data in file.messages():
             writer = writer or BagWriter(target)
-            if not writer.knows(kind):
+            if not writer.knows(encoding):
                 unknown += 1
                 continue
-            if (topic, kind) not in connections:
-                connections[topic, kind] = writer.connect(topic, kind)
-            writer.write(connections[topic, kind], received_ns, data)
+            if (topic, encoding) not in connections:
+                connections[topic, encoding] = writer.connect(topic, encoding)
+            writer.write(connections[topic, encoding], received_ns, data)
     if writer is None:
         raise refusal(
             path, "bag", files[0].name, "holds no message, or is no MCAP file"

@@ -88,25 +88,29 @@ class Signals:
 
         Topics of one table stand side by side at all stamps that any of them has.
         """
-        found = {}
+        by_name = {}
         for name, listed in topics.TABLES.items():
-            parts = [
-                one for table in listed if len(one := self.topic_series[table.key])
+            recorded = [
+                rows for table in listed if len(rows := self.topic_series[table.key])
             ]
-            if len(parts) == 1:
-                found[name] = parts[0]
-            elif parts:
-                stamps = np.unique(np.concatenate([part.stamp_ns for part in parts]))
+            if len(recorded) == 1:
+                by_name[name] = recorded[0]
+            elif recorded:
+                stamps = np.unique(
+                    np.concatenate([series.stamp_ns for series in recorded])
+                )
                 received = np.zeros(len(stamps), dtype=np.int64)
-                for part in parts:
-                    at = np.searchsorted(stamps, part.stamp_ns)
-                    received[at] = np.where(
-                        received[at] > 0, received[at], part.received_ns
+                for series in recorded:
+                    index = np.searchsorted(stamps, series.stamp_ns)
+                    received[index] = np.where(
+                        received[index] > 0, received[index], series.received_ns
                     )
-                columns = tuple(column for part in parts for column in part.columns)
-                values = np.hstack([part.at(stamps) for part in parts])
-                found[name] = Series(columns, stamps, received, values)
-        return found
+                columns = tuple(
+                    column for series in recorded for column in series.columns
+                )
+                values = np.hstack([series.at(stamps) for series in recorded])
+                by_name[name] = Series(columns, stamps, received, values)
+        return by_name
 
     @cached_property
     def missing(self) -> tuple[str, ...]:
@@ -125,8 +129,10 @@ class Signals:
         again.
         """
         name = f"{self.bag.topics.get(key, '').rpartition('/')[0]}: {part}"
-        named = [one for one in self.statuses if one.name.endswith(f": {part}")]
-        return [one for one in named if one.name == name] or named
+        named = [
+            status for status in self.statuses if status.name.endswith(f": {part}")
+        ]
+        return [status for status in named if status.name == name] or named
 
     def time_ns(self, table: str) -> Integers:
         """Time of each row since the start of the run [ns].
@@ -150,8 +156,8 @@ class Signals:
         spacing = np.diff(times_ns)
         if not len(spacing):
             return np.empty((0, 2))
-        at = np.flatnonzero(spacing > LEAST_GAP * max(_usual(spacing), 1))
-        return np.stack([times_ns[at], times_ns[at + 1]], axis=1) / NANOSECONDS
+        starts = np.flatnonzero(spacing > LEAST_GAP * max(_usual(spacing), 1))
+        return np.stack([times_ns[starts], times_ns[starts + 1]], axis=1) / NANOSECONDS
 
     def take(self, *names: str, table: str = "samples") -> Array:
         """Columns of quantities, shape (n, number of names)."""
@@ -178,8 +184,8 @@ class Signals:
         such table.
         """
         if name not in self.tables:
-            allowed = "must be one of those in the bag: " + ", ".join(self.tables)
-            raise refusal(self.bag.path, "table", name, allowed)
+            requirement = "must be one of those in the bag: " + ", ".join(self.tables)
+            raise refusal(self.bag.path, "table", name, requirement)
         series = self.tables[name]
         columns = (*topics.TIMES, *series.columns)
         times = (self.time_ns(name), series.stamp_ns, series.received_ns)
@@ -255,25 +261,25 @@ def read_signals(
         if message.name not in heard:
             heard[message.name] = _Heard(tables.get(message.topic.key))
         heard[message.name].take(message)
-    own = [name for name, one in heard.items() if one.messages > one.foreign]
+    own = [name for name, topic in heard.items() if topic.messages > topic.foreign]
     run = select_topics(bag, own, namespace)
     bag.select(run.names)
     of_run = {key: heard[name] for key, name in run.names.items() if name in heard}
-    for key, one in of_run.items():
-        if one.fault is not None:
-            raise refusal(path, key, *one.fault.args) from None
+    for key, topic in of_run.items():
+        if topic.fault is not None:
+            raise refusal(path, key, *topic.fault.args) from None
         # which others publish on, too
-        if one.foreign and key != topics.JOINT_STATES.key:
+        if topic.foreign and key != topics.JOINT_STATES.key:
             raise refusal(
-                path, key, one.foreign, "messages have none of the robot's joints"
+                path, key, topic.foreign, "messages have none of the robot's joints"
             )
     nothing = _Heard(None)
-    found = {}
+    topic_series = {}
     for key, table in tables.items():
-        one = of_run.get(key, nothing)
-        found[key] = topics.sort_rows(table, one.times, one.numbers, path)
-    if not any(map(len, found.values())):
-        endings = ", ".join(one.ending for one in tables.values())
+        topic = of_run.get(key, nothing)
+        topic_series[key] = topics.sort_rows(table, topic.times, topic.numbers, path)
+    if not any(map(len, topic_series.values())):
+        endings = ", ".join(table.ending for table in tables.values())
         listed = ", ".join(sorted(bag.channels)) or None
         raise refusal(path, "topics", listed, f"must have at least one of {endings}")
     scenes = of_run.get(topics.SCENE_TOPIC.key, nothing).scenes
@@ -284,21 +290,27 @@ def read_signals(
             len(scenes),
             "the recording must hold one scene",
         )
-    stamped = [found[table.key] for table in topics.STAMPED if len(found[table.key])]
+    stamped = [
+        topic_series[table.key]
+        for table in topics.STAMPED
+        if len(topic_series[table.key])
+    ]
     starts = [int(series.stamp_ns[0]) for series in stamped]
-    firsts = [int(series.received_ns[0]) for series in found.values() if len(series)]
+    firsts = [
+        int(series.received_ns[0]) for series in topic_series.values() if len(series)
+    ]
     start_ns = min(starts or firsts)
     origin = f"{path}: {bag.topics.get(topics.SCENE_TOPIC.key)}"
     scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
     reported = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
-    statuses = [one for one in reported if not run.is_of_another(one.name)]
+    statuses = [status for status in reported if not run.is_of_another(status.name)]
     statuses.sort(key=lambda status: status.received_ns)
     joints = of_run.get(topics.JOINT_STATES.key, nothing)
     return Signals(
         bag=bag,
         scene=scene,
         start_ns=start_ns,
-        topic_series=found,
+        topic_series=topic_series,
         idle_states=joints.idle,
         foreign_states=joints.foreign,
         statuses=tuple(statuses),
@@ -327,8 +339,8 @@ class JointSamples(NamedTuple):
 
         Its first one may be after the start of the run.
         """
-        parts = np.split(series.values, 7, axis=1)
-        return cls(series.stamp_ns - start_ns, series.received_ns, *parts)
+        quantities = np.split(series.values, 7, axis=1)
+        return cls(series.stamp_ns - start_ns, series.received_ns, *quantities)
 
 
 @dataclass(frozen=True)
@@ -420,7 +432,9 @@ class Recording(Explained, ReadOnly):
         self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
         runs = found.statuses_of("run", topics.SCENE_TOPIC.key)
         self.reports = tuple(
-            (one.received_ns, one.values) for one in runs if "phase" in one.values
+            (status.received_ns, status.values)
+            for status in runs
+            if "phase" in status.values
         )
         self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
         joints, truth, orientation, euler, ticks = (
@@ -434,52 +448,61 @@ class Recording(Explained, ReadOnly):
             )
         )
         if len(joints) < 2:
-            allowed = (
+            requirement = (
                 f"a run has two samples or more ({found.idle_states} lie before its"
                 " start)"
             )
             if fault := self.diagnostics.get("fault"):
-                allowed += f"; the simulator reports: {fault}"
-            raise refusal(self.path, "joint_states", len(joints), allowed)
+                requirement += f"; the simulator reports: {fault}"
+            raise refusal(self.path, "joint_states", len(joints), requirement)
         if not len(ticks):
             raise refusal(
                 self.path, "applied_torques", 0, "the run has no recorded torque"
             )
-        shown = truth if len(truth) >= 2 else joints
-        self.start_ns = min(int(shown.stamp_ns[0]), int(ticks.stamp_ns[0]))
+        shown_samples = truth if len(truth) >= 2 else joints
+        self.start_ns = min(int(shown_samples.stamp_ns[0]), int(ticks.stamp_ns[0]))
         self.measured = JointSamples.of(joints, self.start_ns)
-        self._truth = JointSamples.of(truth, self.start_ns) if shown is truth else None
+        self._truth = (
+            JointSamples.of(truth, self.start_ns) if shown_samples is truth else None
+        )
         vars(self).update((self._truth or self.measured)._asdict())
-        self.quaternion = orientation.at(shown.stamp_ns)
-        self.euler = euler.at(shown.stamp_ns)
+        self.quaternion = orientation.at(shown_samples.stamp_ns)
+        self.euler = euler.at(shown_samples.stamp_ns)
         with np.errstate(over="ignore"):  # too long is refused just below
             length = np.sqrt(np.einsum("ij,ij->i", self.quaternion, self.quaternion))
         # nan compares False: lost is not wrong
         wrong = length[np.abs(length - 1.0) > 1e-6]
         if len(wrong):
-            allowed = "quaternions must have length 1"
-            raise refusal(self.path, "orientation", float(wrong[0]), allowed)
+            requirement = "quaternions must have length 1"
+            raise refusal(self.path, "orientation", float(wrong[0]), requirement)
         begin_ns = ticks.stamp_ns - self.start_ns
         end_ns = begin_ns + ticks.values[:, 0].astype(np.int64)
         overlap = ticks.stamp_ns[1:][begin_ns[1:] < end_ns[:-1]]
         if len(overlap):
-            allowed = (
+            requirement = (
                 f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
             )
-            raise refusal(self.path, topics.TICK_TABLE.key, int(overlap[0]), allowed)
+            raise refusal(
+                self.path, topics.TICK_TABLE.key, int(overlap[0]), requirement
+            )
         moment = ticks.values[:, 4:]
-        known = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
-        self.ticks = Ticks(begin_ns, end_ns, ticks.torque, moment if known else None)
-        parts = [
-            found.topic_series[one.key]
-            for one in (topics.COMMAND_TABLE, topics.STAMPED_COMMANDS)
+        has_moment = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+        self.ticks = Ticks(
+            begin_ns, end_ns, ticks.torque, moment if has_moment else None
+        )
+        command_series = [
+            found.topic_series[table.key]
+            for table in (topics.COMMAND_TABLE, topics.STAMPED_COMMANDS)
         ]
         order = np.argsort(
-            np.concatenate([part.received_ns for part in parts]), kind="stable"
+            np.concatenate([commands.received_ns for commands in command_series]),
+            kind="stable",
         )
         names = ("stamp_ns", "received_ns", "values")
         columns = (
-            np.concatenate([getattr(part, name) for part in parts])[order]
+            np.concatenate([getattr(commands, name) for commands in command_series])[
+                order
+            ]
             for name in names
         )
         self.commands = Series(topics.COMMAND_TABLE.columns, *columns)
@@ -507,18 +530,22 @@ class Recording(Explained, ReadOnly):
         """
         if self._truth is not None:
             return self._truth
-        shown = self._shown_joints
-        angles = np.abs(np.angle(np.exp(1j * (self.measured.gamma - shown[:, :3]))))
+        of_orientation = self._shown_joints
+        angles = np.abs(
+            np.angle(np.exp(1j * (self.measured.gamma - of_orientation[:, :3])))
+        )
         rates = np.hstack(
             [self.measured.gamma_dot, self.measured.mu_dot, self.measured.beta_dot]
         )
         # Those of a body that turns: nine rates of three numbers.
         size = 1.0 + np.abs(rates).max(axis=1, initial=0.0)
         off = np.maximum(
-            angles.max(axis=1), np.abs(rates - shown[:, 3:]).max(axis=1) / size
+            angles.max(axis=1), np.abs(rates - of_orientation[:, 3:]).max(axis=1) / size
         )
-        known = np.isfinite(off)
-        apart = known.any() and np.mean(off[known] > MEASURED_APART) > MEASURED_SHARE
+        is_known = np.isfinite(off)
+        apart = (
+            is_known.any() and np.mean(off[is_known] > MEASURED_APART) > MEASURED_SHARE
+        )
         return None if apart else self.measured
 
     @cached_property
@@ -529,8 +556,13 @@ class Recording(Explained, ReadOnly):
         """
         model = model_of(self.scene)
         with np.errstate(all="ignore"):
-            found = kernel.joints(model, tuple(self.states[:, :7].T))
-        rows = *found.gamma, *found.gamma_dot, *found.mu_dot, *found.beta_dot
+            of_states = kernel.joints(model, tuple(self.states[:, :7].T))
+        rows = (
+            *of_states.gamma,
+            *of_states.gamma_dot,
+            *of_states.mu_dot,
+            *of_states.beta_dot,
+        )
         return np.stack(
             [np.broadcast_to(row, self.time_ns.shape) for row in rows], axis=1
         )
@@ -551,9 +583,9 @@ class Recording(Explained, ReadOnly):
         neither is.
         """
         truth = self.exact_gamma if self._truth is None else self._truth.gamma
-        at = places(self.time_ns, self.measured.time_ns)
-        turns = np.exp(1j * (self.measured.gamma - truth[at]))
-        return freeze(np.where((at >= 0)[:, None], np.abs(np.angle(turns)), np.nan))
+        index = places(self.time_ns, self.measured.time_ns)
+        turns = np.exp(1j * (self.measured.gamma - truth[index]))
+        return freeze(np.where((index >= 0)[:, None], np.abs(np.angle(turns)), np.nan))
 
     @property
     def period_ns(self) -> int:
@@ -568,9 +600,9 @@ class Recording(Explained, ReadOnly):
         The tick is the one that ends at the sample. [N m], shape (n,); nan where that
         tick is not recorded. Where actuators lag it is the lag.
         """
-        at = places(self.ticks.end_ns, self.time_ns)
-        largest = np.abs(self.effort - self.ticks.torque[at]).max(axis=1)
-        return freeze(np.where(at >= 0, largest, np.nan))
+        index = places(self.ticks.end_ns, self.time_ns)
+        largest = np.abs(self.effort - self.ticks.torque[index]).max(axis=1)
+        return freeze(np.where(index >= 0, largest, np.nan))
 
     def _facts(self) -> dict[str, object]:
         ticks, reported = self.ticks, self.diagnostics
@@ -615,16 +647,17 @@ class Recording(Explained, ReadOnly):
         samples and torques are lost there is a gap. Its error estimate, method and
         message are those that the simulator reported.
         """
-        known, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
+        has_orientation, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
         joints = np.hstack([getattr(self, name) for name in JOINT_QUANTITIES])
         reported, error_estimate = self.diagnostics, np.nan
         with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
         fault = reported.get("fault", "")
-        gaps = self._find_gaps(self.time_ns[known])
+        gaps = self._find_gaps(self.time_ns[has_orientation])
         lost = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
         inside = [
-            any(begin <= one < end for begin, end in gaps) for one in lost.tolist()
+            any(begin <= lost_ns < end for begin, end in gaps)
+            for lost_ns in lost.tolist()
         ]
         law = (
             TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque)
@@ -640,12 +673,12 @@ class Recording(Explained, ReadOnly):
         )
         return Trajectory(
             self.scene,
-            self.seconds[known],
-            self.quaternion[known],
-            self.states[known, 4:7],
-            self.effort[known],
+            self.seconds[has_orientation],
+            self.quaternion[has_orientation],
+            self.states[has_orientation, 4:7],
+            self.effort[has_orientation],
             run=record,
-            joints=joints[known],
+            joints=joints[has_orientation],
             gaps=np.array(gaps) / NANOSECONDS,
         )
 
@@ -661,33 +694,37 @@ class Recording(Explained, ReadOnly):
         known_ns = np.append(
             0, np.cumsum(np.stack([length, 0 * length], axis=1).ravel())
         )[:-1]
-        held = np.diff(np.interp(time_ns, edges, known_ns))
+        with_torque_ns = np.diff(np.interp(time_ns, edges, known_ns))
         longer = end - begin > 1.5 * self.period_ns
-        lost = longer & (held < (end - begin) - 0.5)
+        lost = longer & (with_torque_ns < (end - begin) - 0.5)
         return list(zip(begin[lost].tolist(), end[lost].tolist(), strict=True))
 
 
-def _finite_rows(found: Signals, table: TopicTable) -> Series:
+def _finite_rows(signals: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
-    series = found.topic_series[table.key]
+    series = signals.topic_series[table.key]
     needed = series.values[:, : 4 if table is topics.TICK_TABLE else None]
     finite = np.isfinite(needed)
     if finite.all():
         return series
     absent = [
         column.quantity
-        for column, known in zip(series.columns, finite.T, strict=False)
-        if not known.any()
+        for column, is_finite in zip(series.columns, finite.T, strict=False)
+        if not is_finite.any()
     ]
     if absent and table in (topics.JOINT_STATES, topics.TRUE_JOINT_STATES):
-        allowed = (
+        requirement = (
             "must have these: a whole run has angles and rates of all nine joints, and"
             " efforts of the actuators; `export` writes what there is"
         )
-        raise refusal(found.bag.path, table.key, f"no {_shorten(absent)}", allowed)
+        raise refusal(
+            signals.bag.path, table.key, f"no {_shorten(absent)}", requirement
+        )
     bad = ~finite.all(axis=1)
     stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
-    raise refusal(found.bag.path, table.key, row, f"is not finite at stamp {stamp} ns")
+    raise refusal(
+        signals.bag.path, table.key, row, f"is not finite at stamp {stamp} ns"
+    )
 
 
 def _shorten(quantities: list[str]) -> str:
@@ -696,9 +733,9 @@ def _shorten(quantities: list[str]) -> str:
     All three of a kind become one.
     """
     text = ", ".join(quantities)
-    for kind in dict.fromkeys(name.rpartition("_")[0] for name in quantities):
+    for quantity in dict.fromkeys(name.rpartition("_")[0] for name in quantities):
         text = text.replace(
-            ", ".join(f"{kind}_{leg}" for leg in (1, 2, 3)), f"{kind}_1..3"
+            ", ".join(f"{quantity}_{leg}" for leg in (1, 2, 3)), f"{quantity}_1..3"
         )
     return text
 
@@ -745,10 +782,10 @@ def read_run_motion(bag: str | Path, namespace: str | None = None) -> Trajectory
             Path(bag), "orientation", len(motion), "two samples or more must have one"
         )
     for begin, end in motion.gaps.tolist():
-        allowed = (
+        requirement = (
             f"must be of one motion: nothing is recorded from {begin:g} to {end:g} s"
         )
-        raise refusal(Path(bag), "orientation", len(motion), allowed)
+        raise refusal(Path(bag), "orientation", len(motion), requirement)
     return motion
 
 
@@ -778,7 +815,8 @@ def export(
                 (*topics.TIMES, *series.columns),
             )
             about = {
-                one.name: {"unit": one.unit, "description": one.text} for one in columns
+                column.name: {"unit": column.unit, "description": column.text}
+                for column in columns
             }
             write_table({key: table[key].to_numpy() for key in table}, path, about)
     return paths

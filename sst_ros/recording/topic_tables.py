@@ -114,18 +114,18 @@ class Series:
 
     def at(self, stamps_ns: Integers) -> Array:
         """Rows at these stamps, shape (m, columns); nan where there is none."""
-        there = places(self.stamp_ns, stamps_ns)
-        found = np.full((len(stamps_ns), self.values.shape[1]), np.nan)
-        found[there >= 0] = self.values[there[there >= 0]]
-        return found
+        index = places(self.stamp_ns, stamps_ns)
+        rows = np.full((len(stamps_ns), self.values.shape[1]), np.nan)
+        rows[index >= 0] = self.values[index[index >= 0]]
+        return rows
 
 
 def places(among_ns: Integers, times_ns: Integers) -> Integers:
     """Find where each time stands among ascending ones; -1 where it does not."""
     if not len(among_ns):
         return np.full(len(times_ns), -1)
-    at = np.minimum(np.searchsorted(among_ns, times_ns), len(among_ns) - 1)
-    return np.where(among_ns[at] == times_ns, at, -1)
+    index = np.minimum(np.searchsorted(among_ns, times_ns), len(among_ns) - 1)
+    return np.where(among_ns[index] == times_ns, index, -1)
 
 
 def sort_rows(
@@ -136,28 +136,30 @@ def sort_rows(
     Their times are pairs of stamp and reception [ns]; their numbers follow each other,
     too. Raises InputError where one recording, at this path, has two rows at a stamp.
     """
-    columns, at = table.columns, np.frombuffer(times, dtype=np.int64).reshape(-1, 2)
-    values = np.frombuffer(numbers, dtype=float).reshape(len(at), len(columns))
-    order = np.argsort(at[:, 1], kind="stable")
+    columns, stamp_pairs = (
+        table.columns,
+        np.frombuffer(times, dtype=np.int64).reshape(-1, 2),
+    )
+    values = np.frombuffer(numbers, dtype=float).reshape(len(stamp_pairs), len(columns))
+    order = np.argsort(stamp_pairs[:, 1], kind="stable")
     if table in STAMPED:
-        stamps, order = np.unique(at[:, 0], return_index=True)
-        again = np.delete(np.arange(len(at)), order)
-        if table in (
-            ORIENTATION_TABLE,
-            EULER,
-        ):  # an idle state shows the last sample again
-            first = order[np.searchsorted(stamps, at[again, 0])]
+        stamps, order = np.unique(stamp_pairs[:, 0], return_index=True)
+        again = np.delete(np.arange(len(stamp_pairs)), order)
+        # an idle state shows the last sample again
+        if table in (ORIENTATION_TABLE, EULER):
+            first = order[np.searchsorted(stamps, stamp_pairs[again, 0])]
             again = again[~(values[again] == values[first]).all(axis=1)]
         if len(again):
-            allowed = (
-                f"stamp {at[again[0], 0]} ns comes twice; record one simulator a bag"
+            requirement = (
+                f"stamp {stamp_pairs[again[0], 0]} ns comes twice; record one"
+                " simulator a bag"
             )
-            raise refusal(path, table.key, len(again), allowed)
-    if not np.array_equal(order, np.arange(len(at))):  # most need no copy
-        at, values = at[order], values[order]
+            raise refusal(path, table.key, len(again), requirement)
+    if not np.array_equal(order, np.arange(len(stamp_pairs))):  # most need no copy
+        stamp_pairs, values = stamp_pairs[order], values[order]
     if table is TICK_TABLE and np.isnan(values[:, -3:]).all():
         columns, values = columns[:-3], values[:, :-3]  # no moment was recorded
-    stamps, received = at.T.copy()
+    stamps, received = stamp_pairs.T.copy()
     return Series(columns, stamps, received, values)
 
 
@@ -171,28 +173,34 @@ def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
     if is_idle(stamp, message.header.frame_id):
         return []
     names = tuple(message.name)
-    at, absent = _find_joints(joints, names)
+    index, absent = _find_joints(joints, names)
     if len(absent) == len(joints):
         return None
-    parts = message.position, message.velocity, message.effort
-    sizes = {len(part) for part in parts}
+    quantities = message.position, message.velocity, message.effort
+    sizes = {len(quantity) for quantity in quantities}
     if not sizes <= {0, len(names)}:
-        allowed = "name, position, velocity and effort must be equally long, or empty"
+        requirement = (
+            "name, position, velocity and effort must be equally long, or empty"
+        )
         missing = f"; joints are missing: {', '.join(absent)}" if absent else ""
-        raise InvalidMessage(sorted({len(names), *sizes}), allowed + missing)
+        raise InvalidMessage(sorted({len(names), *sizes}), requirement + missing)
     if not absent and 0 not in sizes:
-        position, velocity, effort = (part[at].tolist() for part in parts)
+        position, velocity, effort = (
+            quantity[index].tolist() for quantity in quantities
+        )
     else:
-        position, velocity, effort = (_take_known(part, at) for part in parts)
+        position, velocity, effort = (
+            _take_known(quantity, index) for quantity in quantities
+        )
     return [(stamp, position + velocity + effort[: len(ACTUATED_JOINTS)])]
 
 
-def _take_known(part: Sequence[float], at: Sequence[int]) -> list[float]:
+def _take_known(numbers: Sequence[float], index: Sequence[int]) -> list[float]:
     """Take numbers by their places, which are negative for what is not there.
 
     Then nan.
     """
-    return [float(part[k]) if k >= 0 and len(part) else np.nan for k in at]
+    return [float(numbers[k]) if k >= 0 and len(numbers) else np.nan for k in index]
 
 
 @lru_cache(maxsize=64)  # all messages of a topic have the same names
@@ -203,9 +211,9 @@ def _find_joints(
 
     An absent joint has the place -1.
     """
-    at = [names.index(name) if name in names else -1 for name in requested]
+    index = [names.index(name) if name in names else -1 for name in requested]
     absent = tuple(name for name in requested if name not in names)
-    return at, absent
+    return index, absent
 
 
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
@@ -213,8 +221,8 @@ def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], 
 
     Where `stamped`, of messages with a stamp only.
     """
-    parts = attrgetter(*(f"{vector}.{name}" for name in names))
-    return partial(_read_parts, parts, stamped)
+    components = attrgetter(*(f"{vector}.{name}" for name in names))
+    return partial(_read_parts, components, stamped)
 
 
 def _read_command(message: Any) -> Rows:
@@ -223,10 +231,10 @@ def _read_command(message: Any) -> Rows:
 
 
 def _read_parts(
-    parts: Callable[[Any], Sequence[float]], stamped: bool, message: Any
+    components: Callable[[Any], Sequence[float]], stamped: bool, message: Any
 ) -> Rows:
     stamp = nanoseconds(message.header.stamp)
-    return [(stamp, parts(message))] if stamp or not stamped else []
+    return [(stamp, components(message))] if stamp or not stamped else []
 
 
 def _read_ticks(message: Any) -> Rows:
@@ -238,7 +246,7 @@ def _read_ticks(message: Any) -> Rows:
     if not start:
         return []
     names = tuple(message.joint_names) or ACTUATED_JOINTS
-    at = _places(ACTUATED_JOINTS, names)
+    index = _places(ACTUATED_JOINTS, names)
     moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
     rows, end = Rows(), start
     for point in message.points:
@@ -249,18 +257,18 @@ def _read_ticks(message: Any) -> Rows:
             )
         begin, end = end, start + nanoseconds(point.time_from_start)
         if end <= begin:
-            allowed = f"ticks must have a length; one at stamp {begin} ns has none"
-            raise InvalidMessage(end - begin, allowed)
+            requirement = f"ticks must have a length; one at stamp {begin} ns has none"
+            raise InvalidMessage(end - begin, requirement)
         moment = [effort[k] for k in moments] or [np.nan] * 3
-        rows.append((begin, [float(end - begin), *(effort[k] for k in at), *moment]))
+        rows.append((begin, [float(end - begin), *(effort[k] for k in index), *moment]))
     return rows
 
 
 def _read_stamped_commands(message: Any) -> Rows:
     if sorted(message.name) != sorted(ACTUATED_JOINTS) or len(message.effort) != 3:
         return []
-    at = _places(ACTUATED_JOINTS, tuple(message.name))
-    return [(nanoseconds(message.header.stamp), message.effort[at].tolist())]
+    index = _places(ACTUATED_JOINTS, tuple(message.name))
+    return [(nanoseconds(message.header.stamp), message.effort[index].tolist())]
 
 
 @lru_cache(maxsize=64)  # all messages of a topic have the same names
@@ -278,7 +286,7 @@ def _table(
     key: str,
     message_type: str,
     rows: Callable[[Any], Rows | None],
-    *parts: tuple[Sequence[str], str, str],
+    *groups: tuple[Sequence[str], str, str],
     owner: str = SIMULATOR_NODE,
 ) -> TopicTable:
     """Make the table of a topic by its key and owner.
@@ -286,7 +294,9 @@ def _table(
     A part is columns, their unit and what.
     """
     columns = [
-        Column(name, unit, what, key) for names, unit, what in parts for name in names
+        Column(name, unit, description, key)
+        for names, unit, description in groups
+        for name in names
     ]
     return TopicTable(key, message_type, owner, columns=tuple(columns), rows=rows)
 
@@ -444,13 +454,13 @@ def select_topics(
     nodes = _find_simulators(bag.candidates)
     spaces = {_parent(node) for node in nodes} or _find_namespaces(bag.candidates)
     chosen = _choose_namespace(bag, spaces, namespace)
-    here = sorted(node for node in nodes if _parent(node) == chosen)
-    if len(here) > 1:
-        allowed = (
+    present = sorted(node for node in nodes if _parent(node) == chosen)
+    if len(present) > 1:
+        requirement = (
             "are of several simulators in one namespace; record one simulator a bag"
         )
-        raise refusal(bag.path, SCENE_TOPIC.key, ", ".join(here), allowed)
-    node = here[0] if here else None
+        raise refusal(bag.path, SCENE_TOPIC.key, ", ".join(present), requirement)
+    node = present[0] if present else None
     names = dict[str, str]()
     for name, topic in bag.candidates.items():
         own = {
@@ -470,37 +480,41 @@ def find_absent(
     bag: Bag, requested: Collection[Topic], run: RunTopics
 ) -> dict[str, Problem]:
     """Return why a requested topic of a run is missing, by its key."""
-    found = {}
-    for topic in (one for one in requested if one.key not in run.names):
-        others = sorted(name for name in bag.channels if topic.may_be(name))
-        typed = [f"{name} ({bag.channels[name]})" for name in others]
-        allowed = f"no topic of type {topic.type} ends in {topic.ending}; record it"
-        if any(name in bag.candidates for name in others):
+    absent = {}
+    for topic in (
+        candidate for candidate in requested if candidate.key not in run.names
+    ):
+        similar = sorted(name for name in bag.channels if topic.may_be(name))
+        typed = [f"{name} ({bag.channels[name]})" for name in similar]
+        requirement = f"no topic of type {topic.type} ends in {topic.ending}; record it"
+        if any(name in bag.candidates for name in similar):
             typed, where = (
-                others,
+                similar,
                 run.node if topic.owner == SIMULATOR_NODE else run.namespace,
             )
-            allowed = f"no such topic is of {where}, whose scene is recorded; record it"
-        found[topic.key] = Problem(topic.key, ", ".join(typed) or None, allowed)
-    return found
+            requirement = (
+                f"no such topic is of {where}, whose scene is recorded; record it"
+            )
+        absent[topic.key] = Problem(topic.key, ", ".join(typed) or None, requirement)
+    return absent
 
 
 def _choose_namespace(bag: Bag, spaces: Collection[str], namespace: str | None) -> str:
     """Return the namespace that is asked for, or the only one; InputError names all."""
     listed = ", ".join(sorted(spaces))
     if namespace is not None:
-        asked = "/" + namespace.strip("/")
-        if asked not in spaces:
-            allowed = (
+        requested = "/" + namespace.strip("/")
+        if requested not in spaces:
+            requirement = (
                 f"must be one in which a run is recorded: {listed or 'there is none'}"
             )
-            raise refusal(bag.path, "namespace", namespace, allowed)
-        return asked
+            raise refusal(bag.path, "namespace", namespace, requirement)
+        return requested
     if len(spaces) > 1:
-        allowed = (
+        requirement = (
             f"must be one of {listed}: the recording has a run in each (--namespace)"
         )
-        raise refusal(bag.path, "namespace", None, allowed)
+        raise refusal(bag.path, "namespace", None, requirement)
     return next(iter(spaces), "/")
 
 
@@ -548,15 +562,17 @@ def _find_controllers(
     for name, topic in bag.candidates.items():
         if topic.owner == CONTROLLER_NODE and name in heard:
             nodes.setdefault(_parent(name), {})[topic.key] = name
-    near = {node: found for node, found in nodes.items() if _parent(node) == namespace}
-    chosen = near or (nodes if alone else {})
+    in_namespace = {
+        node: topics for node, topics in nodes.items() if _parent(node) == namespace
+    }
+    chosen = in_namespace or (nodes if alone else {})
     most = max(map(len, chosen.values()), default=0)
-    best = {node: found for node, found in chosen.items() if len(found) == most}
+    best = {node: topics for node, topics in chosen.items() if len(topics) == most}
     if len(best) > 1:
-        allowed = (
+        requirement = (
             "are of several controllers of this robot; record one controller a bag"
         )
-        problem = Problem("reference", ", ".join(sorted(best)), allowed)
+        problem = Problem("reference", ", ".join(sorted(best)), requirement)
         raise InputError(str(bag.path), [problem])
     return next(iter(best.values()), {})
 

@@ -47,12 +47,12 @@ def connect(address: str) -> Any:
     Raises InputError if none answers there.
     """
     distributed = require("distributed")
-    known = (
+    is_address = (
         "--scheduler",
         address,
         "must be the address of a Dask scheduler, as tcp://host:8786",
     )
-    with refuse_errors("sweep", *known, OSError, ValueError):
+    with refuse_errors("sweep", *is_address, OSError, ValueError):
         return distributed.Client(address, timeout=NO_SCHEDULER, set_as_default=False)
 
 
@@ -182,5 +182,5 @@ _unpickle = lru_cache(maxsize=1)(pickle.loads)
 def describe_versions() -> str:
     """Versions on which the bits of results depend."""
     numpy, scipy = (require(name).__version__ for name in ("numpy", "scipy"))
-    found = f"numpy {numpy}, scipy {scipy}, sst_ros {VERSION}"
-    return "python {}.{}, ".format(*sys.version_info) + found
+    versions = f"numpy {numpy}, scipy {scipy}, sst_ros {VERSION}"
+    return "python {}.{}, ".format(*sys.version_info) + versions

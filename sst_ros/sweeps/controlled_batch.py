@@ -126,7 +126,7 @@ class ControlledBlock(Block):
         noise = 2 * _NOISE if len(feedback.starts) else 0
         self._uniform = np.zeros((noise, width))
         self._starts = np.zeros((1, width), dtype=np.uint64)
-        others = [
+        inputs = [
             *self._memory,
             *self._uniform,
             *self.given,
@@ -135,17 +135,17 @@ class ControlledBlock(Block):
         ]
         results = [*self.given[:3], *self._memory]
         self._answer = [
-            feedback.answer.bind([*self.states(which), *others], results)
+            feedback.answer.bind([*self.states(which), *inputs], results)
             for which in (0, 1)
         ]
 
-    def load(self, part: slice, *columns: NDArray[Any]) -> None:
+    def load(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
         """Take over columns, their memory, gains and noise too."""
-        super().load(part, *columns)
-        fill(self._memory, self._feedback.memory[:, part])
-        fill(self._gains, self._feedback.gains[:, part])
+        super().load(columns_of_block, *columns)
+        fill(self._memory, self._feedback.memory[:, columns_of_block])
+        fill(self._gains, self._feedback.gains[:, columns_of_block])
         if len(self._uniform):
-            fill(self._starts, self._feedback.starts[None, part])
+            fill(self._starts, self._feedback.starts[None, columns_of_block])
 
     def store(self, part: slice, *columns: NDArray[Any]) -> None:
         """Put states, errors, torques and memory back."""
@@ -181,13 +181,15 @@ class ControlledBatch:
         control, length, period = self._control, study.length, self._control.period
         self.samples = round(length / period)
         fits = self.samples > 0 and abs(self.samples * period - length) <= 1e-9 * length
-        allowed = f"must be a whole number of control periods of {period:g} s"
-        refuse_unless("sweep", ("duration", length, fits, allowed))
-        whole = not study.steps or study.steps % self.samples == 0
-        allowed = f"must be a multiple of {self.samples}, the control periods of a run"
-        refuse_unless("sweep", ("steps", study.steps, whole, allowed))
+        requirement = f"must be a whole number of control periods of {period:g} s"
+        refuse_unless("sweep", ("duration", length, fits, requirement))
+        fits_samples = not study.steps or study.steps % self.samples == 0
+        requirement = (
+            f"must be a multiple of {self.samples}, the control periods of a run"
+        )
+        refuse_unless("sweep", ("steps", study.steps, fits_samples, requirement))
         self._controller = Controller(self._scene, self._motion, control, period)
-        varied = {one.key for one in study.variations}
+        varied = {variation.key for variation in study.variations}
 
         def has(*names: str) -> bool:
             return any(
@@ -217,24 +219,26 @@ class ControlledBatch:
         has.
         """
         model = self._batch.model
-        known = len(model.ode.drive)
+        drives = len(model.ode.drive)
         sizes = {
             "references": sum(REFERENCES.values()),
             "y": len(model.ode.state),
             "memory": sum(self._memory_sizes.values()),
             "uniform": 2 * self._noise,
-            "given": known + len(model.names),
+            "given": drives + len(model.names),
             "gains": sum(GAINS.values()),
             "running": 1,
         }
 
         def respond(*inputs: Expression) -> tuple[Any, ...]:
             of = divide(sizes, inputs)
-            plant = model.constants(of["given"][known:]).model
+            plant = model.constants(of["given"][drives:]).model
             new = self._command(kernel.joints(plant, of["y"]), of)
             old = (*of["given"][:3], *of["memory"])
             running = of["running"][0]
-            return tuple(select(running, *both) for both in zip(new, old, strict=True))
+            return tuple(
+                select(running, *choices) for choices in zip(new, old, strict=True)
+            )
 
         program = trace(respond, [f"i{j}" for j in range(sum(sizes.values()))])
         return compile_columns({"answer": program}, sizes["references"])["answer"]
@@ -242,7 +246,10 @@ class ControlledBatch:
     def _command(self, joints: Any, of: Mapping[str, Any]) -> tuple[Any, ...]:
         """Return what law and channel send, three torques, and the new memory."""
         control, space = self._control, ActuatorSpaceMap(Geometry.of(self._scene))
-        given, gains = divide(REFERENCES, of["references"]), divide(GAINS, of["gains"])
+        reference, gains = (
+            divide(REFERENCES, of["references"]),
+            divide(GAINS, of["gains"]),
+        )
         memory = divide(self._memory_sizes, of["memory"])
         new = dict(memory)
         angle, rate = gains["noise"]
@@ -259,7 +266,7 @@ class ControlledBatch:
             carriages = space.carriages(gamma)
             for _ in range(CONTROL_NEWTON_STEPS):
                 observed = space.newton_step(*observed, *carriages)[:4]
-        desired = Reference(**{name: given[name] for name in REFERENCE_SIZES})
+        desired = Reference(**{name: reference[name] for name in REFERENCE_SIZES})
         limit = gains["limit"][0] if self._limited else None
         numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
 
@@ -269,22 +276,22 @@ class ControlledBatch:
         scheme = law.ControlLaw(
             control, torque, space.star_accelerations, *numbers, control.period
         )
-        ahead = given["feedforward"], given["held"]
-        found = scheme.answer(
+        ahead = reference["feedforward"], reference["held"]
+        answer = scheme.answer(
             desired, ahead, gamma, gamma_dot, observed, memory["integral"]
         )
         sent, new["queue"] = control.transmit(
-            found.torque, memory["queue"], given["first"][0]
+            answer.torque, memory["queue"], reference["first"][0]
         )
         if self._limited:
-            cut = axpy(1.0, found.total, -1.0, found.torque)
+            cut = axpy(1.0, answer.total, -1.0, answer.torque)
             new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
             sent = law.bound(sent, gains["plant_limit"][0])
         off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
         sums, most = (
             zip(memory[x], (*off, *sent), strict=True) for x in ("squares", "largest")
         )
-        new |= {"observed": observed, "integral": found.integral}
+        new |= {"observed": observed, "integral": answer.integral}
         new["squares"] = tuple(s + e * e for s, e in sums)
         new["largest"] = tuple(
             s + positive(positive(e) + positive(-e) - s) for s, e in most
@@ -298,7 +305,7 @@ class ControlledBatch:
     def run(
         self,
         batch: Batch,
-        given: dict[str, Array],
+        varied: dict[str, Array],
         rows: NDArray[np.int64],
         steps: int,
         kept: int,
@@ -310,8 +317,8 @@ class ControlledBatch:
         """
         count, hold = len(rows), steps // self.samples
         start, control = self._motion.at(0.0), self._control
-        gamma = given.get("initial.gamma", np.tile(start.gamma, (count, 1)))
-        rate = given.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
+        gamma = varied.get("initial.gamma", np.tile(start.gamma, (count, 1)))
+        rate = varied.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
         memory = np.zeros((sum(self._memory_sizes.values()), count))
         blocks = divide(self._memory_sizes, memory)  # views of its rows
         earlier = (
@@ -324,7 +331,7 @@ class ControlledBatch:
             streams(self._seed, rows) if self._noise else np.zeros(0, dtype=np.uint64)
         )
         samples = [tuple(row) for row in self._references.tolist()]
-        gains = self._make_gains(batch, given, count)
+        gains = self._make_gains(batch, varied, count)
         feedback = Feedback(self.answer, samples, hold, memory, gains, noise)
         width = block_width(count)
         drives = [np.zeros((3, count))]  # torques that were sent before each kept state
@@ -360,8 +367,8 @@ class ControlledBatch:
         sample_counts = np.hstack([begun + 1.0] * 3 + [begun + ~complete] * 3)
         figures = {"rms": np.sqrt(squares / sample_counts), "max": largest}
         table = {
-            f"{what}_{name}_{k + 1}": x[:, 3 * part + k]
-            for part, what in enumerate(("error", "torque"))
+            f"{quantity}_{name}_{k + 1}": x[:, 3 * offset + k]
+            for offset, quantity in enumerate(("error", "torque"))
             for name, x in figures.items()
             for k in range(3)
         }
@@ -382,23 +389,25 @@ class ControlledBatch:
         rows = []
         for k in range(self.samples + 1):
             time = k * round(self._control.period * 1e9) / 1e9
-            at, *torques = self._controller.desire(time)
+            desired_state, *torques = self._controller.desire(time)
             desired = (
-                number for name in REFERENCE_SIZES for number in getattr(at, name)
+                number
+                for name in REFERENCE_SIZES
+                for number in getattr(desired_state, name)
             )
             rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
         return np.array(rows)
 
-    def _make_gains(self, batch: Batch, given: dict[str, Array], count: int) -> Array:
+    def _make_gains(self, batch: Batch, varied: dict[str, Array], count: int) -> Array:
         """Return the gains, a column a scenario; see GAINS."""
 
         def value(name: str) -> Any:
             nominal = getattr(self._control, name)
-            found = given.get(f"control.{name}", np.array(nominal))
-            return found.T if np.ndim(nominal) == 1 and found.ndim == 2 else found
+            values = varied.get(f"control.{name}", np.array(nominal))
+            return values.T if np.ndim(nominal) == 1 and values.ndim == 2 else values
 
         inertia = np.array(self._controller.inertia)[:, None]
-        varies = {"control.stiffness", "control.damping"} & given.keys()
+        varies = {"control.stiffness", "control.damping"} & varied.keys()
         rows = (
             *law.feedback_gains(inertia, value, self._control.direct or bool(varies)),
             inertia,

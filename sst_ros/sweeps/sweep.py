@@ -128,7 +128,7 @@ def sweep(
         "sweep", ("vary", vary, named, "must have keys of the scene, as text")
     )
     rows = {"table" if hasattr(vary, "columns") else "vary": vary}
-    given = {
+    settings = {
         "torque": torque,
         "duration": duration,
         "n": n,
@@ -136,7 +136,7 @@ def sweep(
         **options,
         **rows,
     }
-    study = SweepStudy.from_values({"scene": scene, **given})
+    study = SweepStudy.from_values({"scene": scene, **settings})
     path, run = (
         None if out is None else Path(out),
         {"resume": resume, "progress": progress},
@@ -156,10 +156,10 @@ def run_study(
     """Run a study and return its table; see `sweep`."""
     for module in ("pandas", "pyarrow"):
         require(module)
-    whole = type(workers) is int and 0 <= workers <= 1024
+    is_count = type(workers) is int and 0 <= workers <= 1024
     refuse_unless(
         "sweep",
-        ("workers", workers, whole, "must be a whole number from 0 to 1024"),
+        ("workers", workers, is_count, "must be a whole number from 0 to 1024"),
         ("resume", resume, out is not None or not resume, "needs out"),
     )
     if out is None:
@@ -186,8 +186,8 @@ def hold_folder(out: Path, origin: str) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            allowed = "is being written by another run: wait until that has ended"
-            raise refusal(origin, "--out", str(out), allowed) from None
+            requirement = "is being written by another run: wait until that has ended"
+            raise refusal(origin, "--out", str(out), requirement) from None
         except OSError:  # a network file system may not lock folders
             pass
         yield
@@ -243,8 +243,8 @@ def _compute(
         raise SweepFailed(f"{out}: {error}") from error
     if out is not None:
         return read_sweep(out)
-    parts = [tables[index] for index in range(study.chunks)]
-    return to_frame(require("pyarrow").concat_tables(parts), ready.about)
+    chunks = [tables[index] for index in range(study.chunks)]
+    return to_frame(require("pyarrow").concat_tables(chunks), ready.about)
 
 
 def run_chunk(
@@ -279,10 +279,11 @@ class PreparedSweep:
         ends = Scenarios(study.model_scene, self._ends)
         for row, error in ends.faults(most=1).items():
             texts = [
-                str(one).replace(f"scenario {row}: ", "") for one in error.problems
+                str(problem).replace(f"scenario {row}: ", "")
+                for problem in error.problems
             ]
-            allowed = "within its range: " + "; ".join(texts)
-            raise refusal("sweep", "vary", "makes no scene", allowed)
+            requirement = "within its range: " + "; ".join(texts)
+            raise refusal("sweep", "vary", "makes no scene", requirement)
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
         self.controlled = (
@@ -305,11 +306,15 @@ class PreparedSweep:
         power of c. It is nan where no run reaches the end.
         """
         study, tolerance = self.study, self.study.tolerance
-        whole, kind = (
+        count_of_rows, sampling = (
             (PILOT, "random") if study.table is None else (study.rows, study.sampling)
         )
-        chosen = np.linspace(0, whole - 1, min(PILOT, whole)).astype(int)
-        values = {key: x[chosen] for key, x in study.draw(0, whole, kind).items()}
+        chosen = np.linspace(0, count_of_rows - 1, min(PILOT, count_of_rows)).astype(
+            int
+        )
+        values = {
+            key: x[chosen] for key, x in study.draw(0, count_of_rows, sampling).items()
+        }
         scenarios, starts, _ = self.scenarios(values)
         rows = np.arange(len(chosen))
         unit = 1 if self.controlled is None else self.controlled.samples
@@ -318,10 +323,12 @@ class PreparedSweep:
             coarse, fine = (
                 self.run(scenarios, starts, rows, n)[0] for n in (count, 2 * count)
             )
-            both = coarse.success & fine.success
-            if not both.any():
+            completed = coarse.success & fine.success
+            if not completed.any():
                 return count
-            apart = angle_between(coarse.quaternion[both], fine.quaternion[both])
+            apart = angle_between(
+                coarse.quaternion[completed], fine.quaternion[completed]
+            )
             self.pilot_error = error = float(apart.max())
             if error <= tolerance:
                 return count
@@ -333,11 +340,11 @@ class PreparedSweep:
             count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
             if count > MOST_RUN_STEPS:
                 break
-        allowed = (
+        requirement = (
             f"is not reached by {MOST_RUN_STEPS} steps; give `steps`, or a larger"
             " tolerance"
         )
-        raise refusal("sweep", "tolerance", tolerance, allowed)
+        raise refusal("sweep", "tolerance", tolerance, requirement)
 
     def check(self, values: dict[str, Array]) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
@@ -352,8 +359,8 @@ class PreparedSweep:
                 f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES
             }
             units |= {
-                f"{size}_{name}_{part}_{k}": SIZES[size]
-                for size, name, part in REACTIONS
+                f"{size}_{name}_{statistic}_{k}": SIZES[size]
+                for size, name, statistic in REACTIONS
             }
             units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
             units |= {
@@ -361,9 +368,10 @@ class PreparedSweep:
                 f"torque_max_{k}": "N m",
                 "settling_time": "s",
             }
-        for one in self.study.variations:
+        for variation in self.study.variations:
             units |= dict.fromkeys(
-                one.columns, "1" if one.factor else one.targets[0].spec.unit
+                variation.columns,
+                "1" if variation.factor else variation.targets[0].spec.unit,
             )
         return {
             "version": VERSION,
@@ -372,7 +380,11 @@ class PreparedSweep:
             "duration": self.study.length,
             "study": self.study.document(),
             "units": units,
-            "inputs": [name for one in self.study.variations for name in one.columns],
+            "inputs": [
+                name
+                for variation in self.study.variations
+                for name in variation.columns
+            ],
         }
 
     def chunk(self, index: int) -> pa.Table:
@@ -381,12 +393,12 @@ class PreparedSweep:
         rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
         values = study.draw(int(rows[0]), len(rows))
         scenarios, starts, faults = self.scenarios(values)
-        result, more = self.run(scenarios, starts, rows, self.steps)
+        result, over_time = self.run(scenarios, starts, rows, self.steps)
         columns: dict[str, NDArray[Any]] = {"status": result.status.astype(np.int8)}
         columns |= {
             name: getattr(result, name) for name in ("t", "fault_time", "local_error")
         }
-        columns |= result.columns(self._quantities) | more
+        columns |= result.columns(self._quantities) | over_time
         texts, reason = result.reasons
         if faults:  # no numbers, and the first problem as the reason
             wrong = list(faults)
@@ -396,15 +408,17 @@ class PreparedSweep:
             columns = {name: column.copy() for name, column in columns.items()}
             for name, column in columns.items():
                 column[wrong] = {"status": -1, "fault_time": 0.0}.get(name, np.nan)
-            distinct, which = np.unique(
+            distinct, text_index = np.unique(
                 [f"no scene: {key}" for key in keys], return_inverse=True
             )
-            reason[wrong] = len(texts) + which
+            reason[wrong] = len(texts) + text_index
             texts = np.append(texts, distinct)
         inputs = {
             name: column
-            for one in study.variations
-            for name, column in zip(one.columns, values[one.key].T, strict=True)
+            for variation in study.variations
+            for name, column in zip(
+                variation.columns, values[variation.key].T, strict=True
+            )
         }
         # Arrow copies strided columns an entry at a time.
         named = {"scenario": rows, **inputs, **columns}
@@ -447,9 +461,9 @@ class PreparedSweep:
             else 0
         )
         if self.controlled is not None:
-            result, more = self.controlled.run(batch, starts, rows, steps, every)
+            result, over_time = self.controlled.run(batch, starts, rows, steps, every)
         else:
-            initial, more = self.study.scene.initial, {}
+            initial, over_time = self.study.scene.initial, {}
             gamma = starts.get("initial.gamma", np.array(initial.gamma))
             rate = starts.get("initial.gamma_dot", np.array(initial.gamma_dot))
             if scenarios.count is None:
@@ -459,14 +473,14 @@ class PreparedSweep:
                 gamma, rate, step=step, count=steps, keep_every=every, threads=1
             )
         if result.kept is not None and "reactions" in outputs:
-            more |= self._reactions(batch, scenarios, result)
+            over_time |= self._reactions(batch, scenarios, result)
         if result.kept is not None and "extremes" in outputs:
             with np.errstate(all="ignore"):
                 for (name, end), k in itertools.product(EXTREMES, range(3)):
                     angles = getattr(result.kept, name)[..., k]
-                    more[f"{name}_{end}_{k + 1}"] = getattr(angles, end)(axis=0)
+                    over_time[f"{name}_{end}_{k + 1}"] = getattr(angles, end)(axis=0)
         result.kept = None
-        return result, more
+        return result, over_time
 
     @staticmethod
     def _reactions(
@@ -483,18 +497,18 @@ class PreparedSweep:
         torque = np.moveaxis(kept.torque, -1, 0)
         count = result.t.shape[-1]
         columns = {
-            f"{size}_{name}_{part}_{k + 1}": np.full(count, np.nan)
-            for size, name, part in REACTIONS
+            f"{size}_{name}_{statistic}_{k + 1}": np.full(count, np.nan)
+            for size, name, statistic in REACTIONS
             for k in range(3)
         }
         for first in range(0, count, REACTION_ROWS):
             rows = slice(first, first + REACTION_ROWS)
-            at = kept.t[:, rows], state[..., rows], torque[..., rows]
-            figures = reactions.of(*at, rows).figures
-            for size, name, part in REACTIONS:
-                values = getattr(figures[name][size], part)
+            block = kept.t[:, rows], state[..., rows], torque[..., rows]
+            figures = reactions.of(*block, rows).figures
+            for size, name, statistic in REACTIONS:
+                values = getattr(figures[name][size], statistic)
                 for k in range(3):
-                    columns[f"{size}_{name}_{part}_{k + 1}"][rows] = values[..., k]
+                    columns[f"{size}_{name}_{statistic}_{k + 1}"][rows] = values[..., k]
         for column in columns.values():
             column[result.code < 0] = np.nan
         return columns
@@ -505,8 +519,8 @@ class PreparedSweep:
         """Numbers of the scene by key, and those of a run: initial state, gains."""
         inside: dict[str, Array] = {}
         outside: dict[str, Array] = {}
-        for one in self.study.variations:
-            for key, array in one.parameters(values[one.key]).items():
+        for variation in self.study.variations:
+            for key, array in variation.parameters(values[variation.key]).items():
                 (outside if key.startswith(("initial.", "control.")) else inside)[
                     key
                 ] = array
@@ -518,18 +532,18 @@ def find_range_ends(study: SweepStudy) -> dict[str, Array]:
 
     Of a table these are the rows with the least and the largest number of a column.
     """
-    listed = [one for one in study.variations if one.kind == "table"]
+    listed = [variation for variation in study.variations if variation.kind == "table"]
     picks = {
         pick for x in (study.table or {}).values() for pick in (x.argmin(), x.argmax())
     }
-    middle = {one.key: one.ends()[0] for one in study.variations}
+    middle = {variation.key: variation.ends()[0] for variation in study.variations}
     rows = [
-        middle | {one.key: one.numbers[pick] for one in listed}
+        middle | {variation.key: variation.numbers[pick] for variation in listed}
         for pick in sorted({0} | picks)
     ]
-    for one in study.variations:
-        if one.kind != "table":
-            rows += [rows[0] | {one.key: end} for end in one.ends()]
+    for variation in study.variations:
+        if variation.kind != "table":
+            rows += [rows[0] | {variation.key: end} for end in variation.ends()]
     return {key: np.stack([row[key] for row in rows]) for key in middle}
 
 
@@ -554,9 +568,9 @@ def write_part(
 
 def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
     """Return the checksum of what a file says of itself, and its columns' bits."""
-    said = {key: value for key, value in about.items() if key != "checksum"}
+    record = {key: value for key, value in about.items() if key != "checksum"}
     columns: dict[str, NDArray[Any]] = {}
-    texts = {"about": json.dumps(said, sort_keys=True)}
+    texts = {"about": json.dumps(record, sort_keys=True)}
     for name in table.column_names:
         if name == "reason":
             texts[name] = "\0".join(_read_texts(table[name]))
@@ -567,9 +581,9 @@ def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
 
 def _read_texts(column: pa.ChunkedArray) -> list[str]:
     """Return a column of texts, each distinct one of which is made once."""
-    whole = column.dictionary_encode().combine_chunks()
-    texts: list[str] = whole.dictionary.to_pylist()
-    return [texts[code] for code in whole.indices.to_numpy().tolist()]
+    encoded = column.dictionary_encode().combine_chunks()
+    texts: list[str] = encoded.dictionary.to_pylist()
+    return [texts[code] for code in encoded.indices.to_numpy().tolist()]
 
 
 def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
@@ -584,8 +598,8 @@ def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
         about = json.loads(table.schema.metadata[METADATA])
         if not isinstance(about, dict):
             return None
-        found = about.get("checksum")
-        intact = found is None or found == _checksum(about, table)
+        checksum = about.get("checksum")
+        intact = checksum is None or checksum == _checksum(about, table)
         name = _part_name(about["part"]) if "part" in about else path.name
         refuse_unless(
             "sweep",
@@ -622,8 +636,8 @@ def read_about(path: Path) -> dict[str, Any] | None:
     """
     try:
         with require("pyarrow.parquet").ParquetFile(path) as file:
-            found: dict[str, Any] = json.loads(file.schema_arrow.metadata[METADATA])
-            return found | {"rows": file.metadata.num_rows}
+            metadata: dict[str, Any] = json.loads(file.schema_arrow.metadata[METADATA])
+            return metadata | {"rows": file.metadata.num_rows}
     except _unreadable():
         return None
 
@@ -636,23 +650,23 @@ def find_complete(folder: Path, study: SweepStudy) -> tuple[set[int], int | None
     """
     expected: dict[str, Any] = {"digest": study.digest, "version": VERSION}
     names = {_part_name(index): index for index in range(study.chunks)}
-    found = set()
+    complete = set()
     for path in sorted(folder.glob("part-*.parquet")):
-        part = read_part(path)
+        contents = read_part(path)
         index = names.get(path.name)
-        allowed = f"is none of the {study.chunks} parts of this study: delete it"
-        refuse_unless("sweep", ("--resume", str(path), index is not None, allowed))
-        if part is None or index is None:
+        requirement = f"is none of the {study.chunks} parts of this study: delete it"
+        refuse_unless("sweep", ("--resume", str(path), index is not None, requirement))
+        if contents is None or index is None:
             continue
-        about, table = part
+        about, table = contents
         same = all(about.get(key) == value for key, value in expected.items())
         same = same and "checksum" in about
-        allowed = "is of another study or version: choose another --out"
-        refuse_unless("sweep", ("--resume", str(path), same, allowed))
+        requirement = "is of another study or version: choose another --out"
+        refuse_unless("sweep", ("--resume", str(path), same, requirement))
         expected["steps"] = about["steps"]
         if table.num_rows == len(study.rows_of(index)):
-            found.add(index)
-    return found, expected.get("steps")
+            complete.add(index)
+    return complete, expected.get("steps")
 
 
 def read_sweep(folder: Path) -> pd.DataFrame:
@@ -661,25 +675,25 @@ def read_sweep(folder: Path) -> pd.DataFrame:
     Units and study are in its `attrs`.
     """
     read = [(path, read_part(path)) for path in sorted(folder.glob("part-*.parquet"))]
-    parts = [(path, *part) for path, part in read if part is not None]
-    if not parts:
-        allowed = "must be a folder with files part-*.parquet of `sst-ros sweep`"
-        raise refusal("sweep", "DIR", str(folder), allowed)
-    for path, part in read:
-        allowed = "is not whole: --resume computes it again"
-        refuse_unless("sweep", ("DIR", str(path), part is not None, allowed))
-    first = parts[0][1]
-    for path, about, _ in parts:
+    whole_files = [(path, *contents) for path, contents in read if contents is not None]
+    if not whole_files:
+        requirement = "must be a folder with files part-*.parquet of `sst-ros sweep`"
+        raise refusal("sweep", "DIR", str(folder), requirement)
+    for path, contents in read:
+        requirement = "is not whole: --resume computes it again"
+        refuse_unless("sweep", ("DIR", str(path), contents is not None, requirement))
+    first = whole_files[0][1]
+    for path, about, _ in whole_files:
         same = all(
             about.get(key) == first.get(key) for key in ("digest", "version", "steps")
         )
-        allowed = f"is of another study or version than {parts[0][0].name}"
-        refuse_unless("sweep", ("DIR", str(path), same, allowed))
-    tables = [table.replace_schema_metadata(None) for *_, table in parts]
-    known = {
+        requirement = f"is of another study or version than {whole_files[0][0].name}"
+        refuse_unless("sweep", ("DIR", str(path), same, requirement))
+    tables = [table.replace_schema_metadata(None) for *_, table in whole_files]
+    attributes = {
         key: value for key, value in first.items() if key not in ("part", "checksum")
     }
-    return to_frame(require("pyarrow").concat_tables(tables), known)
+    return to_frame(require("pyarrow").concat_tables(tables), attributes)
 
 
 def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
@@ -694,22 +708,28 @@ def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
 def summarize(table: pd.DataFrame) -> str:
     """Return a text of the table of a study."""
     outputs = table.loc[table["status"] == 0, list_outputs(table)]
-    shown = outputs.describe(percentiles=[0.01, 0.99]).T[["mean", "std", "1%", "99%"]]
-    shown["unit"] = [table.attrs["units"].get(name, "") for name in shown.index]
+    statistics = outputs.describe(percentiles=[0.01, 0.99]).T[
+        ["mean", "std", "1%", "99%"]
+    ]
+    statistics["unit"] = [
+        table.attrs["units"].get(name, "") for name in statistics.index
+    ]
     return render(
         "sweep.txt",
         runs=len(table),
         about=table.attrs,
         reasons=table["reason"].value_counts(),
         causes=correlate(table).head(8).to_dict(),
-        outputs=shown.to_string(float_format="{:.6g}".format) if len(outputs) else "",
+        outputs=statistics.to_string(float_format="{:.6g}".format)
+        if len(outputs)
+        else "",
     )
 
 
 def list_outputs(table: pd.DataFrame) -> list[str]:
     """Names of the outputs of a study."""
-    known = (*table.attrs["inputs"], *_NOT_OUTPUTS)
-    return [name for name in table.columns if name not in known]
+    not_outputs = (*table.attrs["inputs"], *_NOT_OUTPUTS)
+    return [name for name in table.columns if name not in not_outputs]
 
 
 def correlate(table: pd.DataFrame, column: pd.Series | None = None) -> pd.Series:
@@ -723,5 +743,5 @@ def correlate(table: pd.DataFrame, column: pd.Series | None = None) -> pd.Series
     inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
     if column.nunique() < 2 or not inputs:
         return table[[]].sum()
-    found = table[inputs].corrwith(column, method="spearman")
-    return found.sort_values(key=abs, ascending=False)
+    correlations = table[inputs].corrwith(column, method="spearman")
+    return correlations.sort_values(key=abs, ascending=False)

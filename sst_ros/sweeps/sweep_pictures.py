@@ -29,9 +29,9 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     complete = table.loc[table["status"] == 0, list_outputs(table)]
     figures = {"distributions.png": draw_distributions(complete, table.attrs["units"])}
     score, title = _score(table)
-    if shown := correlate(table, score).index[:MOST_INPUTS].tolist():
+    if names := correlate(table, score).index[:MOST_INPUTS].tolist():
         worst = np.argsort(score.to_numpy())[-MOST_RUNS:]
-        figures["worst.png"] = draw_scatter(table[shown], worst, title)
+        figures["worst.png"] = draw_scatter(table[names], worst, title)
     publish(out, "sweep plot", figures)
     return [out / name for name in figures]
 

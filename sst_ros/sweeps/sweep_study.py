@@ -133,8 +133,10 @@ class SweepStudy(Section):
     def rules(self) -> Rules:
         """Refuse keys, outputs and torques that are none."""
         mapping, torque = isinstance(self.vary, Mapping), self.torque
-        allowed = "must be a mapping from keys of the scene to distributions or values"
-        yield not mapping, "vary", self.vary, allowed
+        requirement = (
+            "must be a mapping from keys of the scene to distributions or values"
+        )
+        yield not mapping, "vary", self.vary, requirement
         for name in self.outputs:
             yield (
                 name not in SWEEP_OUTPUTS,
@@ -167,8 +169,8 @@ class SweepStudy(Section):
             source = read_file(path)
         values = read_values(source, str(path))
         mapping = isinstance(values, dict) and isinstance(values.get("vary", {}), dict)
-        allowed = "must be a mapping with the keys scene and vary"
-        refuse_unless(str(path), ("", type(values).__name__, mapping, allowed))
+        requirement = "must be a mapping with the keys scene and vary"
+        refuse_unless(str(path), ("", type(values).__name__, mapping, requirement))
         # Sections take numbers as text; what only `rules` check has them as numbers.
         for name in [name for name in ("vary", "table", "torque") if name in values]:
             values[name] = resolve_numbers(values[name])
@@ -179,16 +181,19 @@ class SweepStudy(Section):
         cls, values: Mapping[str, Any], folder: Path = Path()
     ) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
-        given = {"scene": None} | {key: x for key, x in values.items() if x is not None}
+        settings = {"scene": None} | {
+            key: x for key, x in values.items() if x is not None
+        }
+        scene = settings["scene"]
         # Of os.path, which is False where a name is too long for the file system.
-        if isinstance(given["scene"], str) and os.path.isfile(folder / given["scene"]):  # noqa: PTH113
-            given["scene"] = folder / given["scene"]
-        if isinstance(given.get("table"), str):
-            given["table"] = folder / given["table"]
+        if isinstance(scene, str) and os.path.isfile(folder / scene):  # noqa: PTH113
+            settings["scene"] = folder / scene
+        if isinstance(settings.get("table"), str):
+            settings["table"] = folder / settings["table"]
         # else the unknown ones say more than no scene
-        if given.keys() <= cls.SPECS.keys():
-            given["scene"] = scene_of(given["scene"])
-        return build(cls, given, "sweep")
+        if settings.keys() <= cls.SPECS.keys():
+            settings["scene"] = scene_of(settings["scene"])
+        return build(cls, settings, "sweep")
 
     @cached_property
     def model_scene(self) -> Scene:
@@ -214,58 +219,62 @@ class SweepStudy(Section):
         """Length of a run [s]."""
         moving = None if self.motion is None else self.motion.duration
         duration = self.duration or moving or self.scene.duration or 0.0
-        allowed = "must be given [s]: the scene has none"
-        refuse_unless("sweep", ("duration", None, duration > 0.0, allowed))
+        requirement = "must be given [s]: the scene has none"
+        refuse_unless("sweep", ("duration", None, duration > 0.0, requirement))
         return duration
 
     @cached_property
     def variations(self) -> tuple[Variation, ...]:
         """What varies, key by key."""
-        found: list[Variation] = []
+        variations: list[Variation] = []
         problems = []
-        for key, given in {str(key): given for key, given in self.vary.items()}.items():
+        for key, distribution in {
+            str(key): distribution for key, distribution in self.vary.items()
+        }.items():
             try:
-                found.append(read_variation(key, given, self._targets(key)))
+                variations.append(read_variation(key, distribution, self._targets(key)))
             except (ValueError, TypeError, OverflowError, MemoryError) as error:
-                problems.append(Problem(f"vary.{key}", given, str(error)))
+                problems.append(Problem(f"vary.{key}", distribution, str(error)))
         columns: dict[str, dict[str, Any]] = {}
         # a trailing index is that of a component
         for name, column in (self.table or {}).items():
             columns.setdefault(re.sub(r"(\[\d+\])+$", "", name), {})[name] = column
-        taken = {name for one in found for name in one.columns}
+        taken = {name for variation in variations for name in variation.columns}
         for key, own in columns.items():
             try:
                 if key in self.vary or taken & own.keys():
                     raise ValueError("is given in vary, too")
-                found.append(tabulate(key, own, self._targets(key)))
+                variations.append(tabulate(key, own, self._targets(key)))
             except ValueError as error:
                 problems.append(Problem(f"table.{key}", "given", str(error)))
-        if not (found or problems):
-            allowed = "must name at least one key of the scene"
-            problems.append(Problem("vary", dict(self.vary), allowed))
+        if not (variations or problems):
+            requirement = "must name at least one key of the scene"
+            problems.append(Problem("vary", dict(self.vary), requirement))
         if problems:
             raise InputError("sweep", problems)
-        return tuple(found)
+        return tuple(variations)
 
     @cached_property
     def rows(self) -> int:
         """Number of runs."""
         grid = math.prod(
-            len(one.numbers) for one in self.variations if one.kind == "grid"
+            len(variation.numbers)
+            for variation in self.variations
+            if variation.kind == "grid"
         )
         lengths = {len(values) for values in (self.table or {}).values()}
         alone = len(lengths) <= 1 and not (lengths and grid > 1)
-        allowed = "must have columns of equal length, and no grid beside it"
-        refuse_unless("sweep", ("table", sorted(lengths), alone, allowed))
+        requirement = "must have columns of equal length, and no grid beside it"
+        refuse_unless("sweep", ("table", sorted(lengths), alone, requirement))
         natural = min(lengths, default=grid)
-        rows, known = self.n or natural, bool(self.n or lengths or grid > 1)
+        rows, is_given = self.n or natural, bool(self.n or lengths or grid > 1)
         drawn, fits = (
-            any(one.drawn for one in self.variations),
+            any(variation.drawn for variation in self.variations),
             not lengths or rows <= natural,
         )
         refuse_unless(
             "sweep",
-            ("n", self.n, known or not drawn, "must be given with distributions"),
+            ("n", self.n, is_given or not drawn, "must be given with distributions"),
             ("n", self.n, fits, f"must be <= {natural}, the rows of the table"),
             (
                 "n",
@@ -279,25 +288,29 @@ class SweepStudy(Section):
     def draw(self, first: int, count: int, sampling: str = "") -> dict[str, Array]:
         """Draw rows `first` to `first + count`: (count, components) by varied key."""
         quantiles, used = self._quantiles(first, count, sampling or self.sampling), 0
-        found, index = {}, np.arange(first, first + count)
-        for one in self.variations:
-            if one.drawn:
-                found[one.key] = one.values(
-                    quantiles[:, used : used + len(one.columns)]
+        drawn, index = {}, np.arange(first, first + count)
+        for variation in self.variations:
+            if variation.drawn:
+                drawn[variation.key] = variation.values(
+                    quantiles[:, used : used + len(variation.columns)]
                 )
-                used += len(one.columns)
+                used += len(variation.columns)
             else:
-                found[one.key] = one.numbers[first : first + count]
-        for one in reversed(self.variations):  # the last key of a grid varies fastest
-            if one.kind == "grid":
-                found[one.key] = one.numbers[index % len(one.numbers)]
-                index = index // len(one.numbers)
-        return found
+                drawn[variation.key] = variation.numbers[first : first + count]
+        for variation in reversed(
+            self.variations
+        ):  # the last key of a grid varies fastest
+            if variation.kind == "grid":
+                drawn[variation.key] = variation.numbers[index % len(variation.numbers)]
+                index = index // len(variation.numbers)
+        return drawn
 
     @cached_property
     def _width(self) -> int:
         """Numbers that are drawn for a row."""
-        return sum(len(one.columns) for one in self.variations if one.drawn)
+        return sum(
+            len(variation.columns) for variation in self.variations if variation.drawn
+        )
 
     def _quantiles(self, first: int, count: int, sampling: str) -> Array:
         """Numbers in (0, 1), shape (count, width)."""

@@ -74,10 +74,10 @@ class Variation:
         reached = self.numbers[[0, 2, 3]] if self.kind == "normal" else self.numbers
         for target in self.targets if self.kind != "table" else ():
             numbers, spec = self.parameters(reached)[target.key], target.spec
-            known = numbers[np.isfinite(numbers)]
-            if not np.all(spec.allows(known)):
-                words = f"it reaches from {known.min()} to {known.max()}"
-                raise ValueError(f"{spec.refuse()}; {words}")
+            finite = numbers[np.isfinite(numbers)]
+            if not np.all(spec.allows(finite)):
+                reach = f"it reaches from {finite.min()} to {finite.max()}"
+                raise ValueError(f"{spec.refuse()}; {reach}")
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
@@ -118,11 +118,11 @@ class Variation:
 
     def parameters(self, values: Array) -> dict[str, Array]:
         """Arrays (n, ...) by key of the scene for values (n, components)."""
-        found = {}
+        by_key = {}
         for key, nominal, _ in self.targets:
             rows = values * nominal.ravel() if self.factor else values
-            found[key] = rows.reshape(len(values), *nominal.shape)
-        return found
+            by_key[key] = rows.reshape(len(values), *nominal.shape)
+        return by_key
 
 
 def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
@@ -130,23 +130,26 @@ def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
 
     It is one of a scene, or of settings at a place of the study.
     """
-    found = []
-    for at, value, spec in find_fields(tree, key, place=place):
-        here = key_of(at)
+    targets = []
+    for place_of_field, value, spec in find_fields(tree, key, place=place):
+        full_key = key_of(place_of_field)
         if spec.kind == "number" and value is None:
-            raise ValueError(f"the scene has no {here}")
+            raise ValueError(f"the scene has no {full_key}")
         if isinstance(value, Inertia):
-            parts = (
-                (part, getattr(value, part), of) for part, of in Inertia.SPECS.items()
+            entries = (
+                (entry, getattr(value, entry), of)
+                for entry, of in Inertia.SPECS.items()
             )
-            found += [
-                Target(f"{here}.{part}", np.array(x), of) for part, x, of in parts if x
+            targets += [
+                Target(f"{full_key}.{entry}", np.array(x), of)
+                for entry, x, of in entries
+                if x
             ]
         elif spec.kind == "number":
-            found.append(Target(here, np.array(value, dtype=float), spec))
+            targets.append(Target(full_key, np.array(value, dtype=float), spec))
         else:
             raise ValueError(f"{NO_NUMBER}, or an inertia, as star.inertia does")
-    return found
+    return targets
 
 
 def _scales_tensor(key: str, targets: Sequence[Target]) -> bool:
@@ -154,24 +157,28 @@ def _scales_tensor(key: str, targets: Sequence[Target]) -> bool:
     return targets[0].key.count(".") > key.count(".")
 
 
-def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation:
+def read_variation(key: str, distribution: Any, targets: Sequence[Target]) -> Variation:
     """Read one entry of `vary`, whose key names the targets.
 
     Raises ValueError where it is none.
     """
-    kind, numbers, relative = "grid", given, False
-    if isinstance(given, Mapping):
-        words = dict(given)
-        relative = words.pop("relative", False)
-        kind, numbers = next(iter(words.items())) if len(words) == 1 else ("", ())
-    elif isinstance(given, tuple) and given and isinstance(given[0], str):
-        kind, relative = (
-            given[0],
-            isinstance(given[-1], str) and given[-1] == "relative",
+    form, numbers, relative = "grid", distribution, False
+    if isinstance(distribution, Mapping):
+        options = dict(distribution)
+        relative = options.pop("relative", False)
+        form, numbers = next(iter(options.items())) if len(options) == 1 else ("", ())
+    elif (
+        isinstance(distribution, tuple)
+        and distribution
+        and isinstance(distribution[0], str)
+    ):
+        form, relative = (
+            distribution[0],
+            isinstance(distribution[-1], str) and distribution[-1] == "relative",
         )
-        numbers = given[1 : len(given) - relative]
+        numbers = distribution[1 : len(distribution) - relative]
     listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
-    if kind not in VARIATION_KINDS or not isinstance(relative, bool) or not listed:
+    if form not in VARIATION_KINDS or not isinstance(relative, bool) or not listed:
         raise ValueError(
             f"must be a list of values, or one of {', '.join(VARIATION_KINDS)} with"
             " its numbers"
@@ -182,7 +189,7 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
             f"is a tensor: vary it with relative: true, or {key}.xx, {key}.yy, ..."
         )
     nominal = np.ones(()) if factor else targets[0].nominal
-    if kind == "linspace":
+    if form == "linspace":
         count = numbers[2] if len(numbers) == 3 else 0
         if not (isinstance(count, Integral) and 0 < int(count) <= MOST_VALUES):
             raise ValueError(
@@ -191,33 +198,33 @@ def read_variation(key: str, given: Any, targets: Sequence[Target]) -> Variation
         low, high = (
             np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers[:2]
         )
-        kind, numbers = "grid", np.linspace(low, high, int(count))
-    if kind == "normal" and len(numbers) == 2:
+        form, numbers = "grid", np.linspace(low, high, int(count))
+    if form == "normal" and len(numbers) == 2:
         numbers = (*numbers, -np.inf, np.inf)
-    expected = EXPECTED.get(kind, "")
+    expected = EXPECTED.get(form, "")
     if expected and len(numbers) != expected.count(",") + 1:
-        raise ValueError(f"{kind} takes {expected}")
-    if kind != "grid":
+        raise ValueError(f"{form} takes {expected}")
+    if form != "grid":
         numbers = [np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers]
     values = np.array(real_numbers(numbers))
-    if kind == "grid" and (values.shape[1:] != nominal.shape or not len(values)):
+    if form == "grid" and (values.shape[1:] != nominal.shape or not len(values)):
         raise ValueError(f"must be a list of values of shape {nominal.shape}")
-    bounded = values if kind == "grid" else values[:2]
+    bounded = values if form == "grid" else values[:2]
     if np.isnan(values).any() or not np.isfinite(bounded).all():
         raise ValueError("must be finite numbers")
-    if kind != "grid" and not np.all(values[-2] < values[-1]):
+    if form != "grid" and not np.all(values[-2] < values[-1]):
         raise ValueError("the lower end must be less than the upper one")
     if relative and not factor:
-        if any(not np.array_equal(one.nominal, nominal) for one in targets):
+        if any(not np.array_equal(target.nominal, nominal) for target in targets):
             raise ValueError("its entries differ in the scene: give each by its index")
         values = values * nominal
-        if kind == "normal":  # a negative value has mirrored it
+        if form == "normal":  # a negative value has mirrored it
             values[1] = np.abs(values[1])
-        if kind != "grid":
+        if form != "grid":
             values[-2:] = np.sort(values[-2:], axis=0)
-    if kind == "normal" and not np.all(values[1] > 0.0):
+    if form == "normal" and not np.all(values[1] > 0.0):
         raise ValueError("the standard deviation must be > 0")
-    return Variation(key, kind, values.reshape(len(values), -1), targets, factor)
+    return Variation(key, form, values.reshape(len(values), -1), targets, factor)
 
 
 def tabulate(
@@ -230,25 +237,25 @@ def tabulate(
         np.stack(list(columns.values()), axis=1),
         _scales_tensor(key, targets),
     )
-    found = Variation(key, "table", values, targets, factor)
-    if tuple(columns) != found.columns:
-        raise ValueError(f"needs the columns {', '.join(found.columns)}")
-    return found
+    variation = Variation(key, "table", values, targets, factor)
+    if tuple(columns) != variation.columns:
+        raise ValueError(f"needs the columns {', '.join(variation.columns)}")
+    return variation
 
 
-def read_table(given: Any) -> dict[str, Array]:
+def read_table(source: Any) -> dict[str, Array]:
     """Read columns of numbers from a DataFrame, a mapping, or a CSV or Parquet file."""
     refused = (
         "table",
-        str(given),
+        str(source),
         "must be columns of numbers, or a .csv or .parquet file of them",
     )
     with refuse_errors("sweep", *refused, OSError, ValueError, TypeError, LookupError):
-        if isinstance(given, Path):
-            check_regular(given)
-            kind = "parquet" if given.suffix == ".parquet" else "csv"
-            given = getattr(require("pandas"), f"read_{kind}")(given)
-        columns = {str(name): freeze(real_numbers(given[name])) for name in given}
+        if isinstance(source, Path):
+            check_regular(source)
+            form = "parquet" if source.suffix == ".parquet" else "csv"
+            source = getattr(require("pandas"), f"read_{form}")(source)
+        columns = {str(name): freeze(real_numbers(source[name])) for name in source}
         if not columns or not all(map(np.size, columns.values())):
             raise ValueError("it is empty")
         if all(column.ndim == 1 for column in columns.values()):
