@@ -292,7 +292,11 @@ NEEDED = {
 
 @pytest.mark.parametrize(
     ("line", "modules"),
-    [(line, name) for name, lines in NEEDED.items() for line in lines],
+    [
+        pytest.param(line, name, marks=pytest.mark.slow if number else ())
+        for name, lines in NEEDED.items()
+        for number, line in enumerate(lines)
+    ],
 )
 def test_what_needs_an_extra_says_which(line, modules, tmp_path):
     """After a plain installation, every path ends in the line that says what to

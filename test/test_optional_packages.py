@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from programs import HIDDEN, python
+from slow_cases import slow_except
 
 from sst_ros.errors import EXTRAS, explain_missing_ros, explanation
 
@@ -101,7 +102,9 @@ def test_a_hidden_package_is_explained(hidden):
             assert find_spec(missing[1]) is None, line
 
 
-@pytest.mark.parametrize("hidden", ["viser", "trimesh", "websockets"])
+@pytest.mark.parametrize(
+    "hidden", slow_except(["viser"], ["viser", "trimesh", "websockets"])
+)
 @pytest.mark.parametrize("words", [["viewer"], ["view"]], ids=" ".join)
 def test_the_page_names_the_extra_that_it_needs(hidden, words):
     pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")

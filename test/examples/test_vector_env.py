@@ -16,7 +16,7 @@ def robots_of():
     return runpy.run_path(str(ROOT / "examples" / "vector_env.py"))["StarTriangles"]
 
 
-@pytest.mark.filterwarnings("ignore:.*A Box .* space .*bound")
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m(in|ax)imum value")
 def test_one_robot_passes_gymnasiums_checker(robots_of):
     """The checker knows single environments: one of one robot, begun again by its
     caller.

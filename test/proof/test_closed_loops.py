@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from mpmath import mp, mpf
+from slow_cases import slow_except
 
 from sst_ros import (
     Controller,
@@ -79,9 +80,10 @@ CASES += [
     {"mode": "feedforward_pd", "feedforward_at": "middle"},
     {"mode": "pd", "integral_rate": 5.0, "torque_limit": 0.02},
 ]
+QUICK = [CASES[0], CASES[-2], CASES[-1]]
 
 
-@pytest.mark.parametrize("settings", CASES, ids=str)
+@pytest.mark.parametrize("settings", slow_except(QUICK, CASES), ids=str)
 def test_runs_with_noise_and_another_plant_stay_in_the_tube(settings):
     scene, noise = load_scene("reach"), (1e-6, 1e-4)
     loop = controller(scene, **settings)

@@ -18,6 +18,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from runtime.bench import Message, duration
+from slow_cases import slow_except
 
 from sst_ros.control.controller import SETTLING_BAND, ControlStopped, Measurement
 from sst_ros.control.reference_motions import reference_motion
@@ -273,7 +274,7 @@ class Stream:
 
 
 @pytest.mark.parametrize("takes", [0, 3, 40], ids=lambda takes: f"{takes} samples")
-@pytest.mark.parametrize("every", [10, 50, 167])
+@pytest.mark.parametrize("every", slow_except([50, 167], [10, 50, 167]))
 def test_a_stream_is_followed_without_a_jump_despite_long_checks(
     monkeypatch, takes, every
 ):
