@@ -131,7 +131,7 @@ def test_what_is_no_finite_range_is_refused(width):
         certify("example2", ranges={"star.mass": width})
 
 
-def test_a_geometry_that_is_none_is_refused_with_the_width_that_would_do():
+def test_a_geometry_that_is_none_is_refused_with_a_width():
     times = {"duration": 0.02, "t_eval": [0.02]}
     with pytest.raises(
         InputError, match=r"ranges = 'base\.v': must be narrower"

@@ -211,5 +211,5 @@ BESIDE_A_COMPILATION = """if True:
     """
 
 
-def test_a_node_that_is_told_to_end_does_not_wait_for_a_compilation():
+def test_a_node_that_ends_does_not_wait_for_a_compilation():
     assert python(BESIDE_A_COMPILATION).stdout == "last words"
