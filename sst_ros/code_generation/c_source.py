@@ -135,7 +135,7 @@ def _tanh_function() -> Iterator[str]:
 def _body(named: NamedProgram) -> Iterator[str]:
     """Write the statements: read arguments, compute, store results."""
     program = named.program
-    used = set()
+    used: set[int] = set()
     for operands in (*(operands for _, operands in program.steps), program.outputs):
         # A float is a constant, an int the number of an input or a step.
         used.update(operand for operand in operands if isinstance(operand, int))

@@ -68,14 +68,12 @@ class Library:
     about: str  # of arguments and results, for the head of the module
     collect: str  # defines _collect(values, *shape), which makes a vector or matrix
     unpack: str = "{}"  # of the numbers of an argument
-    function_names: Mapping[str, str] = field(
-        default_factory=dict
-    )  # other names of functions
+    # names of functions where they differ from ours
+    function_names: Mapping[str, str] = field(default_factory=dict)
     positive: str = "maximum({}, 0.0)"  # the larger of a number and zero
     step: str = "where({} > 0.0, 1.0, 0.0)"
-    wrapper: str = (
-        ""  # lines that make what is returned of a function; by default itself
-    )
+    # lines that replace a function by what the module offers; by default itself
+    wrapper: str = ""
 
     def expression(self, operation: str, operands: Sequence[str]) -> str:
         """Write an operation on operands."""
