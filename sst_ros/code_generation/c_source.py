@@ -135,34 +135,30 @@ def _tanh_function() -> Iterator[str]:
 def _body(named: NamedProgram) -> Iterator[str]:
     """Write the statements: read arguments, compute, store results."""
     program = named.program
-    used = {
-        operand
-        for operands in (*(step[1] for step in program.steps), program.outputs)
-        for operand in operands
-        if isinstance(operand, int)
-    }
+    used: set[int] = set()
+    for operands in (*(operands for _, operands in program.steps), program.outputs):
+        # A float is a constant, an int the number of an input or a step.
+        used.update(operand for operand in operands if isinstance(operand, int))
     first = 0
     for argument in named.arguments:
-        numbers = range(first, first + argument.size)
-        yield from _reads(
-            argument, [number - first for number in numbers if number in used]
-        )
+        indices = [i for i in range(argument.size) if first + i in used]
+        yield from _reads(argument, indices)
         first += argument.size
     yield from _statements(program)
-    names = _words(program)
+    names = _value_names(program)
     for i, output in enumerate(program.outputs):
-        yield f"    result[{i}] = {_word(output, names)};"
+        yield f"    result[{i}] = {_operand_text(output, names)};"
 
 
 def _statements(program: Program) -> Iterator[str]:
-    names = _words(program)
+    names = _value_names(program)
     for i, (operation, operands) in enumerate(program.steps):
         assert isinstance(operation, str)  # equations call no routine
-        expression = _expression(operation, [_word(x, names) for x in operands])
+        expression = _expression(operation, [_operand_text(x, names) for x in operands])
         yield f"    const double v{i} = {expression};"
 
 
-def _words(program: Program) -> list[str]:
+def _value_names(program: Program) -> list[str]:
     return [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
 
 
@@ -173,7 +169,7 @@ def _reads(argument: Argument, used: list[int]) -> Iterator[str]:
         yield f"    const double {argument.symbols[i]} = {argument.name}[{i}];"
 
 
-def _word(operand: float | int, names: list[str]) -> str:
+def _operand_text(operand: float | int, names: list[str]) -> str:
     if isinstance(operand, int):
         return names[operand]
     number = repr(float(operand))

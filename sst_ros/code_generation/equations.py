@@ -131,7 +131,7 @@ def equations(
         AssemblyError: the initial gamma has no unique admissible assembly.
 
     """
-    the_scene = scene_of(scene)
+    loaded_scene = scene_of(scene)
     model_target = target in ("fmu", MJCF)
     refuse_unless(
         CALLER,
@@ -151,12 +151,12 @@ def equations(
     )
     output_names = None if outputs is None else tuple(outputs)
     traced = SceneEquations(
-        the_scene, tuple(parameters), () if model_target else output_names
+        loaded_scene, tuple(parameters), () if model_target else output_names
     )
     values = dict(zip(traced.parameters, traced.values, strict=True))
     name = identifier(traced)
     if target == MJCF:
-        files: Mapping[str, str | bytes] = {f"{name}.xml": mjcf(the_scene)}
+        files: Mapping[str, str | bytes] = {f"{name}.xml": mjcf(loaded_scene)}
     elif target in LIBRARIES:
         text = python_module(traced, LIBRARIES[target])
         files = {f"{name}_{target}.py": text}

@@ -217,8 +217,8 @@ class SceneEquations:
         dynamics = self.dynamics
         if not self.parameters:
             return ODE(dynamics).derivative(0.0, *inputs, numbered=True)
-        model, topic = self.model(inputs[size:]), dynamics.has_moment_topic
-        opened = Dynamics(model, has_moment_topic=topic)
+        model = self.model(inputs[size:])
+        opened = Dynamics(model, has_moment_topic=dynamics.has_moment_topic)
         return ODE(opened).derivative(0.0, *inputs[:size])
 
 
@@ -251,9 +251,8 @@ def _energies(equations: SceneEquations) -> NamedProgram:
     def energies(*inputs: Any) -> tuple[Any, ...]:
         model = equations.model(inputs[size:])
         state = inputs[:size]
-        return kernel.kinetic_energy(model, state), kernel.potential_energy(
-            model, state
-        )
+        kinetic = kernel.kinetic_energy(model, state)
+        return kinetic, kernel.potential_energy(model, state)
 
     program = trace(energies, _symbols(arguments))
     description = "kinetic and potential energy [J]"

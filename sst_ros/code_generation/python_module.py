@@ -68,10 +68,12 @@ class Library:
     about: str  # of arguments and results, for the head of the module
     collect: str  # defines _collect(values, *shape), which makes a vector or matrix
     unpack: str = "{}"  # of the numbers of an argument
-    words: Mapping[str, str] = field(default_factory=dict)  # other names of functions
+    # names of functions where they differ from ours
+    function_names: Mapping[str, str] = field(default_factory=dict)
     positive: str = "maximum({}, 0.0)"  # the larger of a number and zero
     step: str = "where({} > 0.0, 1.0, 0.0)"
-    made: str = ""  # lines that make what is returned of a function; by default itself
+    # lines that replace a function by what the module offers; by default itself
+    wrapper: str = ""
 
     def expression(self, operation: str, operands: Sequence[str]) -> str:
         """Write an operation on operands."""
@@ -82,7 +84,7 @@ class Library:
         if operation in ("positive", "step"):
             pattern = self.positive if operation == "positive" else self.step
             return pattern.format(*operands)
-        return f"{self.words.get(operation, operation)}({', '.join(operands)})"
+        return f"{self.function_names.get(operation, operation)}({', '.join(operands)})"
 
 
 def library_of_arrays(name: str, module: str, numbers: str) -> Library:
@@ -93,7 +95,7 @@ def library_of_arrays(name: str, module: str, numbers: str) -> Library:
         imports=f"import {module}\nfrom {module} import {functions}",
         about=ARRAYS_NOTE.format(numbers=numbers),
         collect=STACK.format(library=module),
-        words={"atan2": "arctan2"},
+        function_names={"atan2": "arctan2"},
     )
 
 
@@ -113,7 +115,7 @@ LIBRARIES = {
             unpack="casadi.vertsplit({})",
             positive="fmax({}, 0.0)",
             step="if_else({} > 0.0, 1.0, 0.0)",
-            made='{name} = _function({name}, "{name}", {sizes})',
+            wrapper='{name} = _function({name}, "{name}", {sizes})',
         ),
         Library(
             name="mpmath",
@@ -165,10 +167,10 @@ def _function(named: NamedProgram, library: Library) -> Iterator[str]:
     yield from (f"    {line}" for line in lines)
     shape = ", ".join(map(str, named.shape))
     yield f"    return _collect(({', '.join(results)},), {shape})"
-    if library.made:
-        given = ((argument.name, argument.size) for argument in named.arguments)
-        sizes = ", ".join(f"{name}={size}" for name, size in given)
-        yield f"\n\n{library.made.format(name=named.name, sizes=sizes)}"
+    if library.wrapper:
+        sizes_by_name = ((argument.name, argument.size) for argument in named.arguments)
+        sizes = ", ".join(f"{name}={size}" for name, size in sizes_by_name)
+        yield f"\n\n{library.wrapper.format(name=named.name, sizes=sizes)}"
 
 
 def _write_operations(
@@ -178,7 +180,7 @@ def _write_operations(
     program = named.program
     names = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
 
-    def word(operand: float | int) -> str:
+    def operand_text(operand: float | int) -> str:
         if isinstance(operand, int):
             return names[operand]
         number = repr(float(operand))
@@ -186,5 +188,7 @@ def _write_operations(
 
     lines = []
     for i, (operation, operands) in enumerate(named.steps):
-        lines.append(f"v{i} = {library.expression(operation, [*map(word, operands)])}")
-    return lines, [word(output) for output in program.outputs]
+        lines.append(
+            f"v{i} = {library.expression(operation, [*map(operand_text, operands)])}"
+        )
+    return lines, [operand_text(output) for output in program.outputs]

@@ -218,27 +218,33 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
 
     These are the last diagnostics of the simulator, samples, ticks and losses.
     """
-    period, recorded, spacing = run.period_ns, len(run.time_ns), np.diff(run.time_ns)
-    reported = pd.to_numeric(pd.Series(run.diagnostics, dtype=object), errors="coerce")
-    numbers = {key: value for key, value in reported.items() if np.isfinite(value)}
+    diagnostics = pd.Series(run.diagnostics, dtype=object)
+    numbers = {}
+    for key, value in pd.to_numeric(diagnostics, errors="coerce").items():
+        if np.isfinite(value):
+            numbers[key] = value
     counts = {key: round(value) for key, value in numbers.items()}
-    between, published = len(measured.lost_s), counts.get("samples_published")
+    recorded = len(run.time_ns)
+    missing_between = len(measured.lost_s)
+    published = counts.get("samples_published")
     # Diagnostics that end before the run does know of fewer samples than the bag holds.
-    lost = max(between, (published or 0) - recorded)
-    whole_numbers = ("ticks", "ticks_missed", "commands_received", "commands_dropped")
-    times = (
-        "simulated_time_s",
-        "wall_time_s",
-        "real_time_factor",
-        "step_mean_us",
-        "step_max_us",
-    )
+    lost = max(missing_between, (published or 0) - recorded)
+    stamp_gaps = np.count_nonzero(np.diff(run.time_ns) > run.period_ns)
     return {
         "scene": run.scene.name,
         "bag": str(run.path),
-        **{key: run.diagnostics.get(key) for key in ("phase", "fault", "integrator")},
-        **{key: counts.get(key) for key in whole_numbers},
-        **{key: numbers.get(key) for key in times},
+        "phase": run.diagnostics.get("phase"),
+        "fault": run.diagnostics.get("fault"),
+        "integrator": run.diagnostics.get("integrator"),
+        "ticks": counts.get("ticks"),
+        "ticks_missed": counts.get("ticks_missed"),
+        "commands_received": counts.get("commands_received"),
+        "commands_dropped": counts.get("commands_dropped"),
+        "simulated_time_s": numbers.get("simulated_time_s"),
+        "wall_time_s": numbers.get("wall_time_s"),
+        "real_time_factor": numbers.get("real_time_factor"),
+        "step_mean_us": numbers.get("step_mean_us"),
+        "step_max_us": numbers.get("step_max_us"),
         "simulator_error_estimate": numbers.get("error_estimate"),
         "error_limit_rad": numbers.get("tolerance") or ERROR_LIMIT_RAD,
         "duration_s": float(run.seconds[-1]),
@@ -247,9 +253,9 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "samples_recorded": recorded,
         "samples_lost": lost,
         "samples_recorded_percent": 100.0 * recorded / (recorded + lost),
-        "sample_period_s": period / NANOSECONDS,
-        "stamp_gaps": int(np.count_nonzero(spacing > period)),
-        "samples_missing_between_stamps": between,
+        "sample_period_s": run.period_ns / NANOSECONDS,
+        "stamp_gaps": int(stamp_gaps),
+        "samples_missing_between_stamps": missing_between,
         "idle_states": run.idle_states,
         "foreign_states": run.foreign_states,
         "samples_measured": len(run.measured.time_ns),
@@ -266,25 +272,15 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
 
 def measure_timing(recording: Recording) -> Timing:
     """Measure how regular a recorded run was."""
-    time, received_ns, ticks = recording.time_ns, recording.received_ns, recording.ticks
-    spacing, period, missing = np.diff(time), recording.period_ns, list[str]()
-    period_us = np.diff(received_ns)[spacing == period] / 1e3
+    ticks = recording.ticks
+    missing: list[str] = []
+    spacing = np.diff(recording.time_ns)
+    follows = spacing == recording.period_ns
+    period_us = np.diff(recording.received_ns)[follows] / 1e3
     if np.any(period_us < 0.0):
         missing.append(
             "receptions are not in the order of the samples: periods are as recorded"
         )
-    lost_ns = [
-        time[row] + period * np.arange(1, round(spacing[row] / period))
-        for row in np.flatnonzero(spacing > period).tolist()
-    ]
-    # Simulated time per received time, over pieces of the run.
-    rows = np.unique(
-        np.linspace(0, len(time) - 1, min(61, len(time))).round().astype(int)
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pace = np.diff(time[rows]) / np.diff(received_ns[rows])
-    middle = 0.5 * (time[rows][1:] + time[rows][:-1]) / NANOSECONDS
-    good = np.isfinite(pace) & (pace > 0.0)
     if not recording.diagnostics:
         missing.append(
             "no diagnostics: missed ticks and samples published are not known"
@@ -294,37 +290,64 @@ def measure_timing(recording: Recording) -> Timing:
         missing.append("no commands are recorded: their latency is not known")
     elif commands.empty:
         missing.append("no recorded command is found among the applied torques")
-    first = int(received_ns[0])
-    reports = [values for _, values in recording.reports]
-    reported = pd.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
-    reported_ns = [when_ns - first for when_ns, _ in recording.reports]
-    since_ns = (received_ns - first).astype(float)
-    reported.insert(0, "time_s", np.interp(reported_ns, since_ns, recording.seconds))
-    delays = {
-        "period": pd.Series(period_us, dtype=float),
-        "command_latency": commands.received_us,
-        "command_stamp_to_tick": commands.stamped_us,
-    }
-    numbers = {
+    numbers: dict[str, Any] = {
         "commands_followed": len(commands),
         **_measure_answers(recording, commands),
     }
-    for name, values in delays.items():
+    for name, values in (
+        ("period", pd.Series(period_us, dtype=float)),
+        ("command_latency", commands.received_us),
+        ("command_stamp_to_tick", commands.stamped_us),
+    ):
         described = values.describe([0.99, 0.999]).dropna()
-        numbers |= {
-            f"{name}_{statistic}_us": described.get(key)
-            for key, statistic in STATISTICS.items()
-        }
+        for key, statistic in STATISTICS.items():
+            numbers[f"{name}_{statistic}_us"] = described.get(key)
+    gap_before = ticks.start_ns[1:] != ticks.end_ns[:-1]
     return Timing(
         period_us=period_us,
-        lost_s=np.concatenate([np.empty(0), *lost_ns]) / NANOSECONDS,
-        gaps_s=ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]] / NANOSECONDS,
-        pace=pd.Series(pace[good], middle[good]),
-        reported=reported,
+        lost_s=_lost_times(recording),
+        gaps_s=ticks.end_ns[:-1][gap_before] / NANOSECONDS,
+        pace=_measure_pace(recording),
+        reported=_reported_numbers(recording),
         commands=commands,
         numbers=numbers,
         missing=missing,
     )
+
+
+def _lost_times(recording: Recording) -> Array:
+    """Return the times [s] of samples that are missing between others."""
+    period_ns = recording.period_ns
+    spacing = np.diff(recording.time_ns)
+    lost_ns = [np.empty(0)]
+    for row in np.flatnonzero(spacing > period_ns).tolist():
+        count = round(spacing[row] / period_ns)
+        lost_ns.append(recording.time_ns[row] + period_ns * np.arange(1, count))
+    return np.concatenate(lost_ns) / NANOSECONDS
+
+
+def _measure_pace(recording: Recording) -> Series[float]:
+    """Return simulated time per received time over at most sixty pieces of the run."""
+    time_ns = recording.time_ns
+    borders = np.linspace(0, len(time_ns) - 1, min(61, len(time_ns)))
+    rows = np.unique(borders.round().astype(int))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pace = np.diff(time_ns[rows]) / np.diff(recording.received_ns[rows])
+    middle = 0.5 * (time_ns[rows][1:] + time_ns[rows][:-1]) / NANOSECONDS
+    usable = np.isfinite(pace) & (pace > 0.0)
+    return pd.Series(pace[usable], middle[usable])
+
+
+def _reported_numbers(recording: Recording) -> DataFrame:
+    """Return the numbers of the simulator's reports, see `Timing.reported`."""
+    reports = [values for _, values in recording.reports]
+    reported = pd.DataFrame(reports, columns=REPORTED).replace("", None).astype(float)
+    first_ns = int(recording.received_ns[0])
+    reported_ns = [when_ns - first_ns for when_ns, _ in recording.reports]
+    received_ns = (recording.received_ns - first_ns).astype(float)
+    seconds = np.interp(reported_ns, received_ns, recording.seconds)
+    reported.insert(0, "time_s", seconds)
+    return reported
 
 
 def pair_commands(recording: Recording) -> DataFrame:
@@ -333,42 +356,44 @@ def pair_commands(recording: Recording) -> DataFrame:
     Each has the first tick of its values from its reception on, or from a tick before
     it: the recorder may have received it a little later than the simulator.
     """
-    legs, commands, ticks = ["1", "2", "3"], recording.commands, recording.ticks
+    legs = ["1", "2", "3"]
+    commands = recording.commands
+    ticks = recording.ticks
     limit = recording.scene.torque_limit
     most = np.inf if limit is None else limit
-    commanded, applied = (
-        np.clip(each.torque, -most, most) + 0.0 for each in (commands, ticks)
-    )
-    new, changed = _changes(commanded), _changes(applied)
+    commanded = np.clip(commands.torque, -most, most) + 0.0
+    applied = np.clip(ticks.torque, -most, most) + 0.0
+    new = _changes(commanded)
+    changed = _changes(applied)
     # When the steps of ticks began, interpolated between the receptions of samples.
-    first = recording.received_ns[0]
-    since = (recording.received_ns - first).astype(float)
-    step_ns = first + np.interp(ticks.end_ns, recording.time_ns, since).astype(np.int64)
+    first_ns = recording.received_ns[0]
+    since_ns = (recording.received_ns - first_ns).astype(float)
+    steps_since_ns = np.interp(ticks.end_ns, recording.time_ns, since_ns)
+    step_ns = first_ns + steps_since_ns.astype(np.int64)
+    earliest_ns = commands.received_ns[new] - ticks.period_ns
     left = pd.DataFrame(commanded[new], columns=legs)
-    left = left.assign(command=new, ns=commands.received_ns[new] - ticks.period_ns)
+    left = left.assign(command=new, ns=earliest_ns).sort_values("ns", kind="stable")
     right = pd.DataFrame(applied[changed], columns=legs)
     right = right.assign(tick=changed, ns=step_ns[changed])
-    left, right = (table.sort_values("ns", kind="stable") for table in (left, right))
+    right = right.sort_values("ns", kind="stable")
     pairs = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
     # Commands are in order of reception: the last of those that share a tick is the one
     # it took.
-    pairs = (
-        pairs.dropna(subset="tick")
-        .sort_values("command")
-        .drop_duplicates("tick", keep="last")
+    pairs = pairs.dropna(subset="tick").sort_values("command")
+    pairs = pairs.drop_duplicates("tick", keep="last")
+    command = pairs["command"].to_numpy(dtype=int)
+    tick = pairs["tick"].to_numpy(dtype=int)
+    stamps_ns = commands.stamp_ns[command]
+    begins_ns = ticks.start_ns[tick]
+    age_us = (begins_ns + recording.start_ns - stamps_ns) / 1e3
+    return pd.DataFrame(
+        {
+            "time_s": begins_ns / NANOSECONDS,
+            "received_us": (step_ns[tick] - commands.received_ns[command]) / 1e3,
+            "stamped_us": np.where(stamps_ns > 0, age_us, np.nan),
+            "tick": tick,
+        }
     )
-    command, tick = (pairs[name].to_numpy(dtype=int) for name in ("command", "tick"))
-    stamps, begins = commands.stamp_ns[command], ticks.start_ns[tick]
-    age = (begins + recording.start_ns - stamps) / 1e3
-    received = (step_ns[tick] - commands.received_ns[command]) / 1e3
-    stamped, seconds = np.where(stamps > 0, age, np.nan), begins / NANOSECONDS
-    columns = {
-        "time_s": seconds,
-        "received_us": received,
-        "stamped_us": stamped,
-        "tick": tick,
-    }
-    return pd.DataFrame(columns)
 
 
 def _changes(torque: Array) -> NDArray[np.intp]:
@@ -381,26 +406,27 @@ def _measure_answers(
 ) -> dict[str, float | None]:
     """Return the share of samples that a command answered.
 
-    Also the mean age [s] of the command of a tick.
+    Also the mean age [s] of the command of a tick. Both are None for a torque that is
+    commanded once and for all, which answers no samples.
     """
-    commands, start_ns = recording.commands, recording.ticks.start_ns
-    share = age = None
-    # a torque that is commanded once and for all answers no samples
-    if len(paired) > 1:
-        samples = recording.measured  # what a controller receives
-        if commands.stamp_ns.any():
-            answered = np.isin(samples.time_ns + recording.start_ns, commands.stamp_ns)
-        else:
-            counts = np.searchsorted(
-                commands.received_ns, samples.received_ns, side="left"
-            )
-            answered = np.append(np.diff(counts), 0) > 0
-        # The last sample is the end of the run, which nothing answers.
-        share = 100.0 * float(np.mean(answered[:-1]))
-        begins = np.sort(start_ns[paired.tick])
-        tick = np.searchsorted(begins, start_ns, side="right") - 1
-        ages = start_ns[tick >= 0] - begins[tick[tick >= 0]]
-        age = float(ages.mean() / NANOSECONDS) if len(ages) else 0.0
+    if len(paired) <= 1:
+        return {"samples_answered_percent": None, "command_age_mean_s": None}
+    commands = recording.commands
+    samples = recording.measured  # what a controller receives
+    if commands.stamp_ns.any():
+        answered = np.isin(samples.time_ns + recording.start_ns, commands.stamp_ns)
+    else:
+        received_ns = samples.received_ns
+        counts = np.searchsorted(commands.received_ns, received_ns, side="left")
+        answered = np.append(np.diff(counts), 0) > 0
+    # The last sample is the end of the run, which nothing answers.
+    share = 100.0 * float(np.mean(answered[:-1]))
+    start_ns = recording.ticks.start_ns
+    command_starts = np.sort(start_ns[paired.tick])
+    command = np.searchsorted(command_starts, start_ns, side="right") - 1
+    has_command = command >= 0
+    ages = start_ns[has_command] - command_starts[command[has_command]]
+    age = float(ages.mean() / NANOSECONDS) if len(ages) else 0.0
     return {"samples_answered_percent": share, "command_age_mean_s": age}
 
 
