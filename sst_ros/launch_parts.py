@@ -40,13 +40,8 @@ from sst_ros.description.robot import TOPICS, urdf
 from sst_ros.errors import explain_missing_ros, suggestion
 from sst_ros.nodes import topics
 from sst_ros.runtime import child_process
-from sst_ros.runtime.settings import (
-    LOG_LEVELS,
-    USE_SIM_TIME,
-    SimulatorParameters,
-    default_topics,
-    ros_arguments,
-)
+from sst_ros.runtime.arguments import LOG_LEVELS, USE_SIM_TIME, ros_arguments
+from sst_ros.runtime.settings import SimulatorParameters, default_topics
 from sst_ros.scene.scene import load, share_directory
 from sst_ros.scene.yaml_document import read_file, read_values, resolve_numbers
 from sst_ros.state import BASE_FRAME

@@ -10,7 +10,7 @@ import pytest
 import sst_ros
 from sst_ros import InputError, Simulation, removed, simulate
 from sst_ros.__main__ import main
-from sst_ros.runtime.settings import ros_arguments
+from sst_ros.runtime.arguments import ros_arguments
 
 
 def refuse(function, *arguments, **options):

@@ -65,13 +65,13 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def __init__(self) -> None:
         super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
-        given, own = self.parameters, topics.CONTROLLER
-        self.follower = TrajectoryFollower(scene.load(given.scene), given)
+        parameters, own = self.parameters, topics.CONTROLLER
+        self.follower = TrajectoryFollower(scene.load(parameters.scene), parameters)
         names = ("reference", "tracking_error", "diagnostics")
         publishers = (own[name].publisher(self.node) for name in names)
         self._reference, self._error, self._diagnostics = publishers
-        self._seen: Measurement | None = None
-        self._seen_ns = 0
+        self._measured: Measurement | None = None
+        self._measured_ns = 0
         self._refused, self._last_refusal = 0, ""
         self._has_heard = False
         self._active: topics.ActionGoal | None = None
@@ -137,7 +137,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def see(self, state: JointState) -> None:
         """Measure a state: trajectories begin at the last one."""
-        self._seen, self._seen_ns = _measure(state), nanoseconds(state.header.stamp)
+        self._measured, self._measured_ns = (
+            _measure(state),
+            nanoseconds(state.header.stamp),
+        )
 
     def receive(self, state: JointState) -> None:
         """Answer a state where there is a motion."""
@@ -153,7 +156,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         if self.parameters.wait_for_recorder:
             recorded = (self._reference, self._error)
             missing += [
-                one.topic_name for one in recorded if not one.get_subscription_count()
+                publisher.topic_name
+                for publisher in recorded
+                if not publisher.get_subscription_count()
             ]
         return missing
 
@@ -162,20 +167,20 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
         Without a motion it is None.
         """
-        command = self.follower.preview(self._seen) if self._seen else None
+        command = self.follower.preview(self._measured) if self._measured else None
         return None if command is None else command.torque
 
     def answer(self, state: JointState, stamp_ns: int) -> None:
         """Answer a sample of the run."""
         if (
-            self._seen is None
-            or (command := self.follower.answer(stamp_ns, self._seen)) is None
+            self._measured is None
+            or (command := self.follower.answer(stamp_ns, self._measured)) is None
         ):
             return
         self.begun = True
         self.send(command.torque)
         self._publish(state, command)
-        self._judge(state, self._seen, command)
+        self._judge(state, self._measured, command)
         if self.follower.finished is not None:
             _print(self.follower.finished)
             self.follower.finished = None
@@ -183,9 +188,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             self.done.set()
 
     def _publish(self, state: JointState, command: Command) -> None:
-        at = command.desired
+        desired = command.desired
         for publisher, *numbers in (
-            (self._reference, at.gamma, at.gamma_dot, command.feedforward),
+            (self._reference, desired.gamma, desired.gamma_dot, command.feedforward),
             (self._error, command.error, command.error_rate, command.feedback),
         ):
             position, velocity, effort = (array("d", triple) for triple in numbers)
@@ -212,7 +217,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         None, with the reason logged, where it is bad.
         """
         try:
-            return self.follower.take(trajectory, self._seen, self._seen_ns)
+            return self.follower.take(trajectory, self._measured, self._measured_ns)
         except SstError as error:
             self._refuse(error)
             return None
@@ -249,7 +254,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
     def _report(self) -> None:
         follower = self.follower
         stage = (
-            "waiting for joint_states" if self._seen is None else follower.stage.value
+            "waiting for joint_states"
+            if self._measured is None
+            else follower.stage.value
         )
         counts = (
             follower.samples,
@@ -264,10 +271,13 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             "torques are limited": follower.limited,
             "a trajectory was refused": self._refused,
         }
-        said = [stage, *(text for text, count in doubts.items() if count)]
-        values, level = dict(zip(FOLLOWER_KEYS, row, strict=True)), int(len(said) > 1)
+        statements = [stage, *(text for text, count in doubts.items() if count)]
+        values, level = (
+            dict(zip(FOLLOWER_KEYS, row, strict=True)),
+            int(len(statements) > 1),
+        )
         message = topics.diagnostics(
-            self.node, "control", level, "; ".join(said), values
+            self.node, "control", level, "; ".join(statements), values
         )
         self._diagnostics.publish(message)
 

@@ -36,7 +36,7 @@ from std_msgs.msg import String
 
 from sst_ros.errors import Check, InputError, SstError, refuse_unless
 from sst_ros.nodes import signals, topics
-from sst_ros.runtime import settings
+from sst_ros.runtime import arguments, settings
 from sst_ros.runtime.child_process import is_orphan
 from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.schema import Spec
@@ -93,11 +93,14 @@ class Worker(Generic[P]):
     """
 
     def __init__(
-        self, node: str, cls: type[P], more: Defaults = lambda given: {}
+        self,
+        node: str,
+        cls: type[P],
+        dependent_defaults: Defaults = lambda overrides: {},
     ) -> None:
         self.node, self.done = Node(node), threading.Event()
         self.failure: BaseException | None = None
-        self.parameters = _declare(self.node, cls, more)
+        self.parameters = _declare(self.node, cls, dependent_defaults)
         self.node.add_on_set_parameters_callback(self._set)
 
     def close(self) -> None:
@@ -143,16 +146,19 @@ def _plain_value(spec: Spec, value: Any) -> Any:
     return value
 
 
-def _declare(node: Node, cls: type[P], more: Defaults) -> P:
+def _declare(node: Node, cls: type[P], dependent_defaults: Defaults) -> P:
     # rclpy has no public call for the values that were given; Jazzy and Kilted have
     # this.
-    given: dict[str, Any] = {
-        name: one.value for name, one in node._parameter_overrides.items()
+    overrides: dict[str, Any] = {
+        name: parameter.value for name, parameter in node._parameter_overrides.items()
     }
-    defaults, values = {**vars(cls()), **more(given)}, dict[str, Any]()
+    defaults, values = (
+        {**vars(cls()), **dependent_defaults(overrides)},
+        dict[str, Any](),
+    )
     origin, checks = node.get_fully_qualified_name(), list[Check]()
     for name, spec in cls.SPECS.items():
-        value = _plain_value(spec, given.get(name, defaults[name]))
+        value = _plain_value(spec, overrides.get(name, defaults[name]))
         values[name] = value
         read_only = name not in cls.CHANGEABLE
         try:
@@ -168,11 +174,11 @@ def _declare(node: Node, cls: type[P], more: Defaults) -> P:
         for _, parameters in settings.NODE_COMMANDS.values()
         for name in parameters.SPECS
     }
-    for name in sorted(given.keys() - values.keys()):
+    for name in sorted(overrides.keys() - values.keys()):
         if name in ours:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
-        elif not name.startswith(settings.FOREIGN):
-            checks.append(settings.unknown_name(name, values))
+        elif not name.startswith(arguments.FOREIGN):
+            checks.append(arguments.unknown_name(name, values))
     refuse_unless(origin, *checks)
     try:
         # `build` would take a number for text, as a YAML file has it
@@ -186,10 +192,10 @@ def _declare_empty_list(node: Node, name: str, spec: Spec, *, read_only: bool) -
 
     rclpy takes the type of a list from its entries, and an empty one for bytes.
     """
-    kind = _type_of(spec)
+    value_type = _type_of(spec)
     changeable = _descriptor(name, spec, read_only=False)
-    node.declare_parameter(name, kind, changeable, ignore_override=True)
-    node.set_parameters([Parameter(name, kind, [])])
+    node.declare_parameter(name, value_type, changeable, ignore_override=True)
+    node.set_parameters([Parameter(name, value_type, [])])
     if read_only:
         node.set_descriptor(name, _descriptor(name, spec, read_only=True))
 
@@ -239,34 +245,36 @@ class AnsweringWorker(Worker[A]):
     """
 
     def connect(
-        self, own: dict[str, topics.Endpoint], **more: Callable[[Any], None]
+        self, own: dict[str, topics.Endpoint], **callbacks: Callable[[Any], None]
     ) -> None:
         """Publish commands, and listen to topics of its own table.
 
         Call this as soon as the node can answer.
         """
-        given, self._own = self.parameters, own
+        parameters, self._own = self.parameters, own
         self.begun = self.commanded = False
         self.phase = ""
         self.heard_s = time.monotonic()
         self.foreign_states = 0
         topic, torques = (
-            own["commands_stamped" if given.stamped else "commands"],
+            own["commands_stamped" if parameters.stamped else "commands"],
             array("d", ZERO),
         )
-        if given.stamped:
+        if parameters.stamped:
             self._message: Any = topic.kind(name=list(ACTUATED_JOINTS), effort=torques)
         else:
             self._message = topic.kind(data=torques)
-        self._torques = self._message.effort if given.stamped else self._message.data
-        self._commands = topic.publisher(self.node, simulator=given.simulator)
-        heard = {"phase": self.hear, "joint_states": self.receive, **more}
-        topics.subscribe(self.node, own, given.simulator, **heard)
+        self._torques = (
+            self._message.effort if parameters.stamped else self._message.data
+        )
+        self._commands = topic.publisher(self.node, simulator=parameters.simulator)
+        handlers = {"phase": self.hear, "joint_states": self.receive, **callbacks}
+        topics.subscribe(self.node, own, parameters.simulator, **handlers)
         self._simulator: Any = None
-        if not given.stamped:
-            asked = own["get_parameters"]
-            name = asked.name.format(simulator=given.simulator)
-            self._simulator = self.node.create_client(asked.kind, name)
+        if not parameters.stamped:
+            service = own["get_parameters"]
+            name = service.name.format(simulator=parameters.simulator)
+            self._simulator = self.node.create_client(service.kind, name)
         self._sync: Any = None  # the future of the simulator's parameter
         every(self.node, _WATCH_S, self.watch)
 
@@ -380,8 +388,8 @@ class AnsweringWorker(Worker[A]):
             if self.foreign_states:
                 named = ", ".join(ACTUATED_JOINTS)
                 reason = f"{self.foreign_states} messages without {named} were ignored"
-            others = topics.other_types(self.node, self._own["joint_states"])
-            reasons = "; ".join([reason, *others])
+            robots = topics.other_types(self.node, self._own["joint_states"])
+            reasons = "; ".join([reason, *robots])
             raise SstError(f"no joint_states for {silent:.1f} s: {reasons}")
         if not self.commanded and silent < _WATCH_S and not self.may_begin():
             self.node.get_logger().info(
@@ -409,7 +417,7 @@ class AnsweringWorker(Worker[A]):
         self._commands.publish(self._message)
 
 
-def run(words: Sequence[str]) -> int:
+def run(command_line: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker
@@ -437,13 +445,13 @@ def _leave_compilation(status: int) -> None:
 
 def _run(words: Sequence[str]) -> int:
     signals.handle()
-    command, *given = words
-    if {"-h", "--help"} & set(given):
-        settings.make_parser(command).print_help()
+    command, *node_arguments = command_line
+    if {"-h", "--help"} & set(node_arguments):
+        arguments.make_parser(command).print_help()
         return 0
     configure_middleware()
     try:
-        ros = settings.ros_arguments(command, given)
+        ros = arguments.ros_arguments(command, node_arguments)
         rclpy.init(args=[command, *ros], signal_handler_options=SignalHandlerOptions.NO)
     except InputError as error:
         print(error, file=sys.stderr)
@@ -456,7 +464,7 @@ def _run(words: Sequence[str]) -> int:
         if not signals.came:
             module = importlib.import_module(f"sst_ros.nodes.{command}")
             worker = getattr(module, settings.NODE_COMMANDS[command][0])()
-            for line in settings.unused_files(
+            for line in arguments.unused_files(
                 ros, worker.node.get_fully_qualified_name()
             ):
                 worker.node.get_logger().warning(line)
@@ -583,7 +591,9 @@ def configure_middleware() -> None:
 def _has_library(name: str) -> bool:
     """Look for a shared library where the loader finds that of the middleware."""
     folders = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
-    return any(next(Path(one).glob(f"lib{name}.so*"), None) for one in folders if one)
+    return any(
+        next(Path(folder).glob(f"lib{name}.so*"), None) for folder in folders if folder
+    )
 
 
 def every(node: Node, seconds: float, callback: Callable[[], None]) -> Timer:

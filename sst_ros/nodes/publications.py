@@ -67,8 +67,8 @@ class _Stateless:
 
 def time_of(nanoseconds: int) -> Time:
     """Return a stamp."""
-    seconds, rest = divmod(nanoseconds, NANOSECONDS)
-    return Time(sec=seconds, nanosec=rest)
+    seconds, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return Time(sec=seconds, nanosec=nanosec)
 
 
 class JointStateMessage(_Stateless):
@@ -101,8 +101,8 @@ class OrientationMessage(_Stateless):
     def fill(self, stamp: Time, numbers: Numbers) -> QuaternionStamped:
         """Return the message."""
         self._message.header.stamp = stamp
-        part = self._message.quaternion
-        part.x, part.y, part.z, part.w = numbers.quaternion
+        quaternion = self._message.quaternion
+        quaternion.x, quaternion.y, quaternion.z, quaternion.w = numbers.quaternion
         return self._message
 
 
@@ -116,8 +116,8 @@ class EulerMessage(_Stateless):
     def fill(self, stamp: Time, numbers: Numbers) -> Vector3Stamped:
         """Return the message."""
         self._message.header.stamp = stamp
-        part = self._message.vector
-        part.x, part.y, part.z = zyz_angles(numbers.quaternion)
+        angles = self._message.vector
+        angles.x, angles.y, angles.z = zyz_angles(numbers.quaternion)
         return self._message
 
 
@@ -170,8 +170,8 @@ class TorqueLog:
     def take(self, stamp_ns: int) -> JointTrajectory:
         """Return the message of the ticks logged since stamp_ns and clear the log."""
         for tick in range(len(self._points) + 1, len(self) + 1):
-            seconds, rest = divmod(tick * self._period_ns, NANOSECONDS)
-            end = Duration(sec=seconds, nanosec=rest)
+            seconds, nanosec = divmod(tick * self._period_ns, NANOSECONDS)
+            end = Duration(sec=seconds, nanosec=nanosec)
             self._points.append(JointTrajectoryPoint(time_from_start=end))
         points = self._points[: len(self)]
         for point, row in zip(points, self._rows, strict=True):
@@ -263,7 +263,9 @@ class SimulatorTopics:
 
         Raises InputError for unknown ones, and for a /clock that the node follows, too.
         """
-        publishers = {one.topic_name: one for one in self._node.publishers}
+        publishers = {
+            publisher.topic_name: publisher for publisher in self._node.publishers
+        }
         names = [
             self._node.resolve_topic_name(name)
             for name in settings.wait_for_subscribers
@@ -296,7 +298,9 @@ class SimulatorTopics:
     def missing_subscribers(self) -> list[str]:
         """Return the topics of wait_for_subscribers that have no subscriber."""
         return [
-            one.topic_name for one in self._awaited if not one.get_subscription_count()
+            publisher.topic_name
+            for publisher in self._awaited
+            if not publisher.get_subscription_count()
         ]
 
     @property
@@ -358,10 +362,10 @@ class SimulatorTopics:
             self._publish_clock(stamp_ns if moves else self._time_ns)
         self.flush()
         self._torques.publish(self._log.take(0))
-        at = state.joints
+        joints = state.joints
         angles, rates = (
-            at.gamma + at.mu + at.beta,
-            at.gamma_dot + at.mu_dot + at.beta_dot,
+            joints.gamma + joints.mu + joints.beta,
+            joints.gamma_dot + joints.mu_dot + joints.beta_dot,
         )
         numbers = Numbers(state.quaternion, angles, rates, state.torque)
         if at_rest:
@@ -388,10 +392,10 @@ class SimulatorTopics:
 
     def _count_subscribers(self, age_ns: int) -> None:
         """Find the topics that are read, unless that was done so long ago [ns]."""
-        now = time.monotonic_ns()
-        if now - self._counted_ns < age_ns:
+        now_ns = time.monotonic_ns()
+        if now_ns - self._counted_ns < age_ns:
             return
-        self._counted_ns = now
+        self._counted_ns = now_ns
         self._read = {
             key: publisher
             for key, publisher in self._states.items()

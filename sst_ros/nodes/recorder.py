@@ -49,21 +49,21 @@ def own_topics(
     tables = (topics.CONTROLLER, topics.SIMULATOR)
     nodes = set(default)
     for topic in requested:
-        node, _, word = topic.rpartition("/")
+        node, _, name = topic.rpartition("/")
         for table in tables:
-            one = table.get(word)
+            endpoint = table.get(name)
             if (
-                one is not None
-                and one.use == topics.PUBLISHES
-                and one.name.startswith("~")
+                endpoint is not None
+                and endpoint.use == topics.PUBLISHES
+                and endpoint.name.startswith("~")
             ):
                 nodes.add(node)
     return {
-        one.at(node): one
+        endpoint.at(node): endpoint
         for node in nodes
         for table in tables
-        for one in table.values()
-        if one.use in (topics.PUBLISHES, topics.SUBSCRIBES)
+        for endpoint in table.values()
+        if endpoint.use in (topics.PUBLISHES, topics.SUBSCRIBES)
     }
 
 
@@ -105,9 +105,9 @@ class RecordedTopic:
         """
         self.messages += 1
         if not self.heard:
-            kind = self.subscription.msg_type
+            message_type = self.subscription.msg_type
             self.heard = not self.shared or _is_of_simulator(
-                deserialize_message(data, kind)
+                deserialize_message(data, message_type)
             )
         number, publisher = (
             info.get("publication_sequence_number"),
@@ -124,9 +124,9 @@ class Recorder(Worker[RecorderParameters]):
 
     def __init__(self) -> None:
         super().__init__("sst_recorder", RecorderParameters)
-        given = self.parameters
+        parameters = self.parameters
         self._requested = {
-            self.node.resolve_topic_name(topic) for topic in given.topics if topic
+            self.node.resolve_topic_name(topic) for topic in parameters.topics if topic
         }
         default = (f"sst_{command}" for command in ("simulator", "inverse_dynamics"))
         self._own = own_topics(
@@ -134,16 +134,20 @@ class Recorder(Worker[RecorderParameters]):
         )
         self._foreign = self._requested - self._own.keys()
         sampled = {
-            topic for topic, one in self._own.items() if one.name in topics.SAMPLED
+            topic
+            for topic, endpoint in self._own.items()
+            if endpoint.name in topics.SAMPLED
         }
         self._required = self._requested & sampled
         self._recorded: dict[str, RecordedTopic] = {}
         self._unknown: set[str] = set()
         self._ready = False
         self._failure: SstError | None = None
-        self._timeout_s, self._began_s = given.timeout, time.monotonic()
+        self._timeout_s, self._began_s = parameters.timeout, time.monotonic()
         dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
-        self._bag = BagWriter(Path(dated if given.output == "-" else given.output))
+        self._bag = BagWriter(
+            Path(dated if parameters.output == "-" else parameters.output)
+        )
         self.node.get_logger().info(f"recording to {self._bag.path}")
         every(self.node, _LOOK_PERIOD_S, self._look)
         every(self.node, _TAKE_PERIOD_S, self._take)
@@ -161,7 +165,9 @@ class Recorder(Worker[RecorderParameters]):
         text = f"{self._bag.messages} messages of {len(heard)} topics recorded"
         self.node.get_logger().info(text)
         lost = [
-            f"{one.lost} of {name}" for name, one in self._recorded.items() if one.lost
+            f"{recorded.lost} of {name}"
+            for name, recorded in self._recorded.items()
+            if recorded.lost
         ]
         faults = [f"no message of {_join(self._missing())}"] if self._missing() else []
         faults += [f"lost messages: {_join(lost)}"] if lost else []
@@ -232,14 +238,16 @@ class Recorder(Worker[RecorderParameters]):
             DurabilityPolicy.VOLATILE,
             ReliabilityPolicy.BEST_EFFORT,
         )
-        if all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offers):
+        if all(
+            offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers
+        ):
             durability = DurabilityPolicy.TRANSIENT_LOCAL
-        if all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers):
+        if all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers):
             reliability = ReliabilityPolicy.RELIABLE
         qos = QoSProfile(depth=_DEPTH, durability=durability, reliability=reliability)
-        kind, group = topics.message_type(type_name), topics.NeverSpun()
+        message_type, group = topics.message_type(type_name), topics.NeverSpun()
         subscription = self.node.create_subscription(
-            kind, topic, lambda _: None, qos, callback_group=group, raw=True
+            message_type, topic, lambda _: None, qos, callback_group=group, raw=True
         )
         counted = own is not None and not (own.latched or own.name.startswith("/"))
         connection = self._bag.connect(topic, type_name, [_bag_qos(qos)])
@@ -259,14 +267,14 @@ class Recorder(Worker[RecorderParameters]):
             self.done.set()
 
 
-def _bag_qos(asked: QoSProfile) -> interfaces.Qos:
+def _bag_qos(qos: QoSProfile) -> interfaces.Qos:
     """QoS that a player of the bag offers: that of the subscription."""
     never = interfaces.QosTime(2147483647, 4294967295)
     return interfaces.Qos(
         history=interfaces.QosHistory.KEEP_LAST,
-        depth=asked.depth,
-        reliability=interfaces.QosReliability[asked.reliability.name],
-        durability=interfaces.QosDurability[asked.durability.name],
+        depth=qos.depth,
+        reliability=interfaces.QosReliability[qos.reliability.name],
+        durability=interfaces.QosDurability[qos.durability.name],
         deadline=never,
         lifespan=never,
         liveliness=interfaces.QosLiveliness.AUTOMATIC,

@@ -79,24 +79,24 @@ class MeasuredJointStateMessage:
     def restart(self) -> None:
         """Restart at the first sample of a run: the same seed gives the same noise."""
         self._random = np.random.default_rng(self._seed)
-        kinds = range(_KIND_COUNT)
+        letters = range(_KIND_COUNT)
         self._angles = [
-            ChannelState(self._channel, (self._seed, kind)) for kind in kinds
+            ChannelState(self._channel, (self._seed, letter)) for letter in letters
         ]
         # Rates are only late, as the angles are: those have their noise, too.
-        self._rates = [ChannelState(self._channel, 0) for kind in kinds]
+        self._rates = [ChannelState(self._channel, 0) for letter in letters]
 
     def fill(self, stamp: Time, numbers: Numbers) -> Any:
         """Return the message; None for a sample that is dropped."""
         angles: list[float] = []
         rates: list[float] = []
-        for kind in range(_KIND_COUNT):
-            legs = slice(3 * kind, 3 * kind + 3)
-            measured = self._angles[kind].measure(
+        for letter in range(_KIND_COUNT):
+            legs = slice(3 * letter, 3 * letter + 3)
+            measured = self._angles[letter].measure(
                 triple(numbers.angles[legs]), triple(numbers.rates[legs])
             )
-            angles += self._angles[kind].transmit(measured.gamma)
-            rates += self._rates[kind].transmit(measured.gamma_dot)
+            angles += self._angles[letter].transmit(measured.gamma)
+            rates += self._rates[letter].transmit(measured.gamma_dot)
         if self._dropped_share and self._random.random() < self._dropped_share:
             return None
         return self._exact.fill(stamp, numbers._replace(angles=angles, rates=rates))
@@ -153,8 +153,8 @@ class ImuMessage:
         """Return the message."""
         message, reading = self._message, self._transmit(self._measure(numbers))
         message.header.stamp = stamp
-        part = message.orientation
-        part.x, part.y, part.z, part.w = reading.quaternion
+        orientation = message.orientation
+        orientation.x, orientation.y, orientation.z, orientation.w = reading.quaternion
         _set_vector(message.angular_velocity, reading.angular_velocity)
         _set_vector(message.linear_acceleration, reading.specific_force)
         return message

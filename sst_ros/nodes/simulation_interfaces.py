@@ -76,9 +76,9 @@ def offer(
         return
     answers = SimulationInterfaces(loop, leave, base_frame, types)
     qos = topics.SERVICE_QOS
-    for name, kind in _SERVICE_KINDS.items():
+    for name, type_name in _SERVICE_KINDS.items():
         node.create_service(
-            types[kind], f"~/{name}", getattr(answers, name), qos_profile=qos
+            types[type_name], f"~/{name}", getattr(answers, name), qos_profile=qos
         )
     topics.ActionGoal.serve(
         node, types["SimulateSteps"], "~/simulate_steps", answers.begin_steps
@@ -169,10 +169,10 @@ class SimulationInterfaces:
                 response, UNSUPPORTED, "the one entity is filtered by its name only"
             )
         try:
-            found = re.search(filters.filter, ENTITY_NAME) is not None
+            is_listed = re.search(filters.filter, ENTITY_NAME) is not None
         except re.error as error:
             return answer(response, FAILED, f"filter {filters.filter!r}: {error}")
-        response.entities = [ENTITY_NAME] if found else []
+        response.entities = [ENTITY_NAME] if is_listed else []
         return answer(response, RESULT_OK)
 
     def get_entities_states(self, request: Any, response: Any) -> Any:
@@ -205,17 +205,17 @@ class SimulationInterfaces:
             return answer(
                 response, FAILED, f"frame_id {frame!r} must be {self._base_frame}"
             )
-        now, refusal = self._loop.simulation.state, INVALID_POSE
-        quaternion, rate = now.quaternion, _turn(now.quaternion, now.body_rate)
+        state, refusal = self._loop.simulation.state, INVALID_POSE
+        quaternion, rate = state.quaternion, _turn(state.quaternion, state.body_rate)
         try:
             if getattr(request, "set_pose", True):  # the flags are new in 2.1
-                given = _numbers(pose.orientation, "xyzw")
+                components = _numbers(pose.orientation, "xyzw")
                 if (
-                    not abs((length := float(np.linalg.norm(given))) - 1.0)
+                    not abs((length := float(np.linalg.norm(components))) - 1.0)
                     < _LENGTH_DEVIATION
                 ):
                     raise ValueError(f"orientation has length {length:.6g}, must be 1")
-                quaternion = tuple(part / length for part in given)
+                quaternion = tuple(component / length for component in components)
                 if any(_numbers(pose.position, "xyz")):
                     raise ValueError(
                         "position must be zero: the star turns about the origin"
@@ -240,20 +240,22 @@ class SimulationInterfaces:
 
         A thread asks for the steps, so that the node answers meanwhile.
         """
-        kind = self._types["SimulateSteps"]
+        action_type = self._types["SimulateSteps"]
 
         def run() -> None:
             steps, reply = int(handle.request.steps), Reply(True, "")
-            for done in range(1, steps + 1):
+            for steps_done in range(1, steps + 1):
                 if handle.is_cancel_requested:
                     break
                 reply = self._loop.ask(self._loop.step)
                 if not reply.success:
                     break
-                left = steps - done
-                feedback = kind.Feedback(completed_steps=done, remaining_steps=left)
+                left = steps - steps_done
+                feedback = action_type.Feedback(
+                    completed_steps=steps_done, remaining_steps=left
+                )
                 handle.publish_feedback(feedback)
-            goal.end(answer_with(kind.Result(), reply), success=reply.success)
+            goal.end(answer_with(action_type.Result(), reply), success=reply.success)
 
         goal = topics.ActionGoal(handle)
         threading.Thread(target=run, daemon=True).start()
@@ -267,20 +269,20 @@ class SimulationInterfaces:
         serial singularity an ArithmeticError is raised.
         """
         x, y, z = (rotation_matrix(quaternion).T @ rate).tolist()
-        at = self._space.of_star(quaternion, (x, y, z), ZERO)
-        assembly = kinematics.admissible(self._space.geometry, at.gamma)
+        reference = self._space.of_star(quaternion, (x, y, z), ZERO)
+        assembly = kinematics.admissible(self._space.geometry, reference.gamma)
         if not angle_between(quaternion_of(assembly.rotation), quaternion) < _SAME:
             text = "the orientation belongs to another assembly mode"
-            raise AssemblyError(text, np.array(at.gamma))
-        return at.gamma, at.gamma_dot
+            raise AssemblyError(text, np.array(reference.gamma))
+        return reference.gamma, reference.gamma_dot
 
     def _fill(self, message: Any) -> Any:
         state = self._loop.simulation.state
         stamp = divmod(self._loop.stamp_ns(state), NANOSECONDS)
         message.header.stamp.sec, message.header.stamp.nanosec = stamp
         message.header.frame_id = self._base_frame
-        at, turning = message.pose.orientation, message.twist.angular
-        at.x, at.y, at.z, at.w = state.quaternion
+        orientation, turning = message.pose.orientation, message.twist.angular
+        orientation.x, orientation.y, orientation.z, orientation.w = state.quaternion
         turning.x, turning.y, turning.z = _turn(state.quaternion, state.body_rate)
         return message
 

@@ -47,10 +47,10 @@ class Simulator(Worker[SimulatorParameters]):
 
     def __init__(self) -> None:
         super().__init__("sst_simulator", SimulatorParameters, _defaults_of_scene)
-        given = self.parameters
-        simulated = _load_scene(given)
-        self._topics = SimulatorTopics(self.node, simulated, given)
-        run = self._run = given.run
+        parameters = self.parameters
+        simulated = _load_scene(parameters)
+        self._topics = SimulatorTopics(self.node, simulated, parameters)
+        run = self._run = parameters.run
         names = ["commands", "commands_stamped"]
         if simulated.moment is not None and simulated.moment.topic:
             names.append("external_moment")
@@ -61,12 +61,14 @@ class Simulator(Worker[SimulatorParameters]):
         self._followed = FollowedClock(self.node) if followed else None
         source = self._followed or SteadyTime()
         longest_ns = FOLLOWED_STEP_NS if followed else 0
-        self._pacer = Pacer(run.period_ns, given.real_time_factor, source, longest_ns)
+        self._pacer = Pacer(
+            run.period_ns, parameters.real_time_factor, source, longest_ns
+        )
         build = partial(
             Simulation,
-            integrator=given.integrator,
-            tolerance=given.tolerance,
-            equations=given.equations,
+            integrator=parameters.integrator,
+            tolerance=parameters.tolerance,
+            equations=parameters.equations,
         )
         self._latency = CpuDmaLatency()
         parts = RunParts(run, self._input, self._pacer, self._topics)
@@ -74,7 +76,7 @@ class Simulator(Worker[SimulatorParameters]):
         self._diagnostics = RunDiagnostics(self._loop)
         RunServices(self.node, self._loop, lambda: self.parameters)
         simulation_interfaces.offer(
-            self.node, self._loop, self.done.set, given.base_frame
+            self.node, self._loop, self.done.set, parameters.base_frame
         )
         every(self.node, 1.0, self._report)
         self._read_gauges()
@@ -122,25 +124,30 @@ class Simulator(Worker[SimulatorParameters]):
 
         The machine may sleep as it likes where no deadlines are kept.
         """
-        given, thread, shown = (
+        parameters, thread, diagnostics = (
             self.parameters,
             self._thread.native_id,
             self._diagnostics,
         )
         if thread is None or not self._thread.is_alive():
             return
-        paced, running = given.real_time_factor > 0.0, self._loop.phase is Phase.RUNNING
+        paced, running = (
+            parameters.real_time_factor > 0.0,
+            self._loop.phase is Phase.RUNNING,
+        )
         try:
-            scheduling = schedule(given.realtime_priority if paced else 0, thread)
+            scheduling = schedule(parameters.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
             return
         latency = self._latency.request(
-            given.cpu_dma_latency if paced and running else -1
+            parameters.cpu_dma_latency if paced and running else -1
         )
         granted = {"scheduling": scheduling, "cpu_dma_latency": latency}
-        for what in (key for key in granted if granted[key] != shown.granted[key]):
-            self.node.get_logger().info(f"{what}: {granted[what]}")
-        shown.granted = granted
+        for changed in (
+            key for key in granted if granted[key] != diagnostics.granted[key]
+        ):
+            self.node.get_logger().info(f"{changed}: {granted[changed]}")
+        diagnostics.granted = granted
 
     def _read_gauges(self) -> None:
         self._diagnostics.gauges = read_gauges(self._loop.simulation, self._loop.held)
@@ -201,21 +208,21 @@ class Simulator(Worker[SimulatorParameters]):
             yield f"another node is named {own}, too"
 
 
-def _defaults_of_scene(given: dict[str, Any]) -> dict[str, Any]:
+def _defaults_of_scene(overrides: dict[str, Any]) -> dict[str, Any]:
     """Return the defaults that are those of the scene.
 
     They are its initial state, and in lockstep its duration. Faults of the scene are
     reported later.
     """
     try:
-        simulated = scene.load(given.get("scene", SimulatorParameters().scene))
+        simulated = scene.load(overrides.get("scene", SimulatorParameters().scene))
     except (InputError, TypeError):
         return {}
     defaults: dict[str, Any] = {
         "state_gamma": simulated.initial.gamma,
         "state_gamma_dot": simulated.initial.gamma_dot,
     }
-    if given.get("sync") == "lockstep":
+    if overrides.get("sync") == "lockstep":
         defaults["duration"] = simulated.duration or 0.0
     return defaults
 
@@ -229,8 +236,8 @@ def _load_scene(settings: SimulatorParameters) -> Scene:
     if not settings.external_moment:
         return simulated
     is_constant = simulated.moment is not None and not simulated.moment.topic
-    allowed = f"must be false: scene {simulated.name} has a constant moment"
-    refuse_unless("simulator", ("external_moment", True, not is_constant, allowed))
+    requirement = f"must be false: scene {simulated.name} has a constant moment"
+    refuse_unless("simulator", ("external_moment", True, not is_constant, requirement))
     return dataclasses.replace(simulated, moment=Moment(topic=True))
 
 

@@ -438,19 +438,19 @@ def optional_types(node: Node, type_names: Sequence[str]) -> dict[str, Any] | No
     package = type_names[0].partition("/")[0]
     if importlib.util.find_spec(package) is None:
         return None
-    kinds = {}
+    types = {}
     try:
         for type_name in type_names:
-            kind = message_type(type_name)
-            check_for_type_support(kind)
-            kinds[type_name.rpartition("/")[2]] = kind
+            message_class = message_type(type_name)
+            check_for_type_support(message_class)
+            types[type_name.rpartition("/")[2]] = message_class
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         node.get_logger().warning(
             f"{package} is installed but incomplete, not used ({reason})"
         )
         return None
-    return kinds
+    return types
 
 
 def subscribe(
@@ -461,8 +461,8 @@ def subscribe(
 ) -> None:
     """Create a node's subscriptions to topics of its own table, by the names there."""
     for name, callback in callbacks.items():
-        one, topic = own[name], own[name].name.format(simulator=simulator)
-        node.create_subscription(one.kind, topic, callback, one.qos())
+        endpoint, topic = own[name], own[name].name.format(simulator=simulator)
+        node.create_subscription(endpoint.kind, topic, callback, endpoint.qos())
 
 
 def publishers(node: Node, topic: str, *, best_effort: bool = False) -> list[str]:
@@ -500,7 +500,7 @@ def other_types(node: Node, topic: Endpoint, *, simulator: str = "") -> list[str
 
 
 def diagnostics(
-    node: Node, what: str, level: int, text: str, values: dict[str, Any]
+    node: Node, subject: str, level: int, text: str, values: dict[str, Any]
 ) -> DiagnosticArray:
     """Build a DiagnosticArray of one status of a node.
 
@@ -508,7 +508,7 @@ def diagnostics(
     """
     status = DiagnosticStatus(level=bytes([level]), message=text)
     name = node.get_fully_qualified_name()
-    status.name, status.hardware_id = f"{name}: {what}", name
+    status.name, status.hardware_id = f"{name}: {subject}", name
     status.values = [KeyValue(key=key, value=str(x)) for key, x in values.items()]
     message = DiagnosticArray(status=[status])
     message.header.stamp = node.get_clock().now().to_msg()
@@ -537,10 +537,10 @@ def take(subscription: Subscription[Any]) -> tuple[bytes, dict[str, Any]] | None
     """
     handle: Any = subscription.handle
     with handle:
-        one: tuple[bytes, dict[str, Any]] | None = handle.take_message(
+        taken: tuple[bytes, dict[str, Any]] | None = handle.take_message(
             subscription.msg_type, True
         )
-    return one
+    return taken
 
 
 class Reader:
@@ -574,15 +574,17 @@ class Reader:
             self._published = self._subscription.get_publisher_count() > 0
         elif not self._published and until_ns < math.inf:
             return ()
-        found: list[Any] = []
-        while len(found) < MOST_WAITING and (following := self._next or self._take()):
+        messages: list[Any] = []
+        while len(messages) < MOST_WAITING and (
+            following := self._next or self._take()
+        ):
             message, arrived_ns = following
             self.waiting = arrived_ns > until_ns
             self._next = following if self.waiting else None
             if self.waiting:
                 break
-            found.append(message)
-        return found
+            messages.append(message)
+        return messages
 
     def _take(self) -> tuple[Any, int] | None:
         """Take the next message and find when it arrived; None if there is none."""
@@ -608,15 +610,27 @@ class ActionGoal:
 
     @staticmethod
     def serve(
-        node: Node, kind: Any, name: str, begin: Callable[[Any], None], **more: Any
+        node: Node,
+        action_type: Any,
+        name: str,
+        begin: Callable[[Any], None],
+        **extra_callbacks: Any,
     ) -> None:
         """Serve an action whose goals `begin` makes, from handles of rclpy."""
         # most nodes have no action
         from rclpy.action.server import ActionServer, CancelResponse
 
-        given = {"cancel_callback": lambda _: CancelResponse.ACCEPT, **more}
+        callbacks = {
+            "cancel_callback": lambda _: CancelResponse.ACCEPT,
+            **extra_callbacks,
+        }
         ActionServer(
-            node, kind, name, lambda _: None, handle_accepted_callback=begin, **given
+            node,
+            action_type,
+            name,
+            lambda _: None,
+            handle_accepted_callback=begin,
+            **callbacks,
         )
 
     async def _wait(self, _: Any) -> Any:

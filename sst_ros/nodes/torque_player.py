@@ -53,10 +53,10 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
 
         They are held until the next sample or the end of the profile.
         """
-        given = self.parameters
+        parameters = self.parameters
         end_ns = round(self._duration * NANOSECONDS)
-        hold_ns = min(given.period_ns, max(0, end_ns - elapsed_ns))
-        at_ns = elapsed_ns + (hold_ns / 2 if given.hold == "middle" else 0)
+        hold_ns = min(parameters.period_ns, max(0, end_ns - elapsed_ns))
+        at_ns = elapsed_ns + (hold_ns / 2 if parameters.hold == "middle" else 0)
         return self._profile(at_ns / NANOSECONDS)
 
     def _check_period(self, stamp_ns: int) -> None:
@@ -73,12 +73,14 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
         )
 
 
-def _load(given: PlayerParameters) -> tuple[TorqueFunction, float]:
-    if given.csv != "-":
-        table = TorqueTable.read(given.csv)
+def _load(parameters: PlayerParameters) -> tuple[TorqueFunction, float]:
+    if parameters.csv != "-":
+        table = TorqueTable.read(parameters.csv)
         return table, float(table.times[-1])
-    played = scene.load(given.scene)
+    played = scene.load(parameters.scene)
     if played.torque is None or played.duration is None:
-        allowed = "must have torque and duration to be played, or csv must name a file"
-        raise refusal("torque_player", "scene", played.name, allowed)
+        requirement = (
+            "must have torque and duration to be played, or csv must name a file"
+        )
+        raise refusal("torque_player", "scene", played.name, requirement)
     return played.torque.at, played.duration

@@ -41,7 +41,7 @@ class Viewer(Worker[ViewerParameters]):
 
     def __init__(self) -> None:
         super().__init__("sst_viewer", ViewerParameters)
-        given = self.parameters
+        parameters = self.parameters
         self.scene: Scene | None = None
         self._phase, self._status = "", RunStatus()
         self._start_ns, self._time_ns = 0, 0
@@ -51,20 +51,20 @@ class Viewer(Worker[ViewerParameters]):
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[str, Client[Any, Any]] = {
             name: self.node.create_client(
-                one.kind,
-                one.name.format(simulator=given.simulator),
+                endpoint.kind,
+                endpoint.name.format(simulator=parameters.simulator),
                 qos_profile=topics.SERVICE_QOS,
             )
-            for name, one in topics.VIEWER.items()
-            if one.use == topics.CALLED_SERVICES
+            for name, endpoint in topics.VIEWER.items()
+            if endpoint.use == topics.CALLED_SERVICES
         }
-        heard = {"joint_states": self._take_state, "scene": self._take_scene}
-        heard |= {"phase": self._take_phase, "diagnostics": self._take_diagnostics}
-        topics.subscribe(self.node, topics.VIEWER, given.simulator, **heard)
+        handlers = {"joint_states": self._take_state, "scene": self._take_scene}
+        handlers |= {"phase": self._take_phase, "diagnostics": self._take_diagnostics}
+        topics.subscribe(self.node, topics.VIEWER, parameters.simulator, **handlers)
         every(self.node, _REPEAT_S, self._repeat)
         every(self.node, _LOOK_S, self._look)
-        self._page = Page(self, given.host, given.port)
-        self._page.announce(opened=given.open)
+        self._page = Page(self, parameters.host, parameters.port)
+        self._page.announce(opened=parameters.open)
 
     def close(self) -> None:
         """Leave the actuators without torque; end the page."""
@@ -86,10 +86,10 @@ class Viewer(Worker[ViewerParameters]):
         client = self._clients[request if paused is None else "pause"]
         if not client.service_is_ready():
             return False, f"no service {client.srv_name}: is the simulator running?"
-        given: Any = (
+        message: Any = (
             Trigger.Request() if paused is None else SetBool.Request(data=paused)
         )
-        future, answered = client.call_async(given), threading.Event()
+        future, answered = client.call_async(message), threading.Event()
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(_REPLY_S):
             return False, f"no reply within {_REPLY_S:g} s"

@@ -46,9 +46,9 @@ class Assistant:
         theirs.close()
         self._connection.send(self._function)
 
-    def call(self, *given: Any) -> None:
+    def call(self, *arguments: Any) -> None:
         """Have the function called; not before the result of the last call is there."""
-        self._calls.put(given)
+        self._calls.put(arguments)
 
     def result(self) -> Any:
         """Return the result of the call, or the SstError why there is none.
@@ -61,9 +61,9 @@ class Assistant:
 
     def _exchange(self) -> None:
         while not self._closed:
-            given = self._calls.get()
+            arguments = self._calls.get()
             try:
-                self._connection.send(given)
+                self._connection.send(arguments)
                 self._results.put(self._connection.recv())
             except (EOFError, OSError):
                 if self._closed:
@@ -90,9 +90,9 @@ def assist(number: int) -> None:
         function = connection.recv()
         os.nice(10)
         while True:
-            given = connection.recv()
+            arguments = connection.recv()
             try:
-                result = function(*given)
+                result = function(*arguments)
             except Exception as error:
                 result = error if isinstance(error, SstError) else SstError(repr(error))
             connection.send(result)

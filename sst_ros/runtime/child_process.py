@@ -30,7 +30,7 @@ _next = itertools.count(os.getpid())  # what comes later leaves the last ones to
 
 @contextmanager
 def run_beside(
-    command: str, given: dict[str, object], **more: Any
+    command: str, parameters: dict[str, object], **popen_options: Any
 ) -> Iterator[Popen[str]]:
     """Have a node with parameters beside a block.
 
@@ -39,9 +39,19 @@ def run_beside(
     Behind the block it gets SIGINT, and is killed if its end takes 10 s.
     """
     keep_domain()
-    started = [sys.executable, "-m", "sst_ros", command, "--ros-args", *words(given)]
+    started = [
+        sys.executable,
+        "-m",
+        "sst_ros",
+        command,
+        "--ros-args",
+        *words(parameters),
+    ]
     with Popen(
-        started, env={**os.environ, PARENT: str(os.getpid())}, text=True, **more
+        started,
+        env={**os.environ, PARENT: str(os.getpid())},
+        text=True,
+        **popen_options,
     ) as process:
         try:
             yield process
@@ -94,12 +104,17 @@ def _refuse_nodes(domain: int) -> None:
             probe.bind(("", port))
 
 
-def words(given: dict[str, object]) -> list[str]:
+def words(parameters: dict[str, object]) -> list[str]:
     """Give parameters as --ros-args takes them."""
-    shown = {
-        key: str(x).lower() if isinstance(x, bool) else x for key, x in given.items()
+    values = {
+        key: str(x).lower() if isinstance(x, bool) else x
+        for key, x in parameters.items()
     }
-    return [word for key, value in shown.items() for word in ("-p", f"{key}:={value}")]
+    return [
+        argument
+        for key, value in values.items()
+        for argument in ("-p", f"{key}:={value}")
+    ]
 
 
 def is_orphan() -> bool:

@@ -211,14 +211,14 @@ class RunDiagnostics:
 
     def _news_of(self, values: dict[str, Any], last_refusal: str) -> list[str]:
         """Say which counts of faults have grown since the last status."""
-        words = {
+        texts = {
             "commands_dropped": f"command dropped: {last_refusal}",
             "commands_clamped": "commands clamped to the scene's torque limit",
             "command_timeouts": "no command within command_timeout: not held",
         }
         news = [
             f"{text} ({values[key]} in all)"
-            for key, text in words.items()
+            for key, text in texts.items()
             if values[key] > self._last.get(key, 0)
         ]
         publishers = values["command_publishers"]
@@ -243,13 +243,13 @@ class RunDiagnostics:
             )
 
 
-def read_gauges(simulation: Simulation, held: HeldTorques) -> dict[str, object]:
+def read_gauges(simulation: Simulation, held_torques: HeldTorques) -> dict[str, object]:
     """Read the gauges in the thread of the run.
 
     Those without a finite value are left out.
     """
     conditioning = simulation.conditioning
-    hold_errors = held.errors(simulation)
+    hold_errors = held_torques.errors(simulation)
     of_start, of_middle = (None, None) if hold_errors is None else hold_errors
     margins = _margins_of(simulation)
     gauges = {
@@ -277,9 +277,9 @@ def _margins_of(simulation: Simulation) -> dict[str, float]:
     angles = (*joints.gamma, *joints.mu, *joints.beta)
     margins: dict[str, float] = {}
     for limit in limits_of(simulation.scene, simulation.geometry):
-        kind = JOINTS[limit.joint].partition("_")[0]
+        joint_letter = JOINTS[limit.joint].partition("_")[0]
         distance = limit.distance(angles)
-        margins[kind] = min(distance, margins.get(kind, math.inf))
+        margins[joint_letter] = min(distance, margins.get(joint_letter, math.inf))
     return margins
 
 

@@ -105,7 +105,7 @@ class RunLoop(TickLoop):
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
         self._missing_since = time.monotonic()
         self._output.publish_phase(self._status)
-        warm, shown = False, -math.inf
+        warm, last_shown_s = False, -math.inf
         while not (
             self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed
         ):
@@ -116,21 +116,21 @@ class RunLoop(TickLoop):
                 if self.requested.is_set():
                     self._serve()
                 if self.phase is Phase.WAITING and not self._start(self._run.waits):
-                    if time.monotonic() - shown > IDLE_PERIOD_S:
-                        shown = time.monotonic()
+                    if time.monotonic() - last_shown_s > IDLE_PERIOD_S:
+                        last_shown_s = time.monotonic()
                         self.show(fault=False, waits=True)
                     time.sleep(_POLL_S)
                 elif self.phase is Phase.RUNNING:
                     if self.to_next_sample(paced=True) and self.complete:
-                        self._rest(Phase.FINISHED)
+                        self._stop_in(Phase.FINISHED)
                 elif self.phase in (Phase.PAUSED, Phase.FAULT):
                     self.show(fault=bool(self.fault))
                     self.requested.wait(IDLE_PERIOD_S)
             except (RunStopped, NoAnswer) as stopped:
                 self._fail(str(stopped))
             except Exception as error:
-                at = traceback.extract_tb(error.__traceback__)[-1]
-                where = f"{at.filename.rpartition('/')[2]}:{at.lineno}"
+                frame = traceback.extract_tb(error.__traceback__)[-1]
+                where = f"{frame.filename.rpartition('/')[2]}:{frame.lineno}"
                 self._fail(f"internal error: {type(error).__name__}: {error} ({where})")
                 self.stopped.wait(IDLE_PERIOD_S)
         self.publish_rest()
@@ -144,7 +144,7 @@ class RunLoop(TickLoop):
             return Reply(False, f"fault, reset first: {self.fault}")
         if paused:
             reply = "already paused" if self.phase is Phase.PAUSED else "paused"
-            self._rest(Phase.PAUSED)
+            self._stop_in(Phase.PAUSED)
             return Reply(True, reply)
         if self.phase is not Phase.PAUSED:
             return Reply(True, f"not paused: {self.phase.value}")
@@ -176,7 +176,7 @@ class RunLoop(TickLoop):
                 self._fail(str(stopped))
                 return Reply(False, self._status)
             if self.complete:
-                self._rest(Phase.FINISHED)
+                self._stop_in(Phase.FINISHED)
                 break
         return Reply(True, f"at {self.simulation.time_ns / 1e9:.9f} s")
 
@@ -199,7 +199,7 @@ class RunLoop(TickLoop):
         As two requests a run that waits for nothing would begin between them.
         """
         if self.phase is not Phase.FAULT:
-            self._rest(Phase.PAUSED)
+            self._stop_in(Phase.PAUSED)
         self.reset()
         self._to(Phase.PAUSED)
         return Reply(True, f"at the initial state, {self.phase.value}")
@@ -260,7 +260,7 @@ class RunLoop(TickLoop):
         self._to(Phase.RUNNING)
         self.resume()
 
-    def _rest(self, phase: Phase) -> None:
+    def _stop_in(self, phase: Phase) -> None:
         self.publish_rest()
         self._to(phase)
 

@@ -43,13 +43,15 @@ def schedule(priority: int, thread: int) -> str:
     return f"SCHED_FIFO {priority}"
 
 
-def _schedule_all(policy: int, thread: int, priority: int, others: int) -> None:
+def _schedule_all(policy: int, thread: int, priority: int, other_priority: int) -> None:
     policy |= os.SCHED_RESET_ON_FORK
     os.sched_setscheduler(thread, policy, os.sched_param(priority))
     for task in Path("/proc/self/task").iterdir():
         if int(task.name) != thread:
             with contextlib.suppress(ProcessLookupError):  # it has ended
-                os.sched_setscheduler(int(task.name), policy, os.sched_param(others))
+                os.sched_setscheduler(
+                    int(task.name), policy, os.sched_param(other_priority)
+                )
 
 
 class CpuDmaLatency:

@@ -1,32 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes: source of descriptors, checks, --help, tables of docs.
-
-On the command line every parameter is a plain option, beside ROS arguments. What is
-wrong with those other than the name of a parameter, `rclpy.init` says: --help and a
-misspelt option need no ROS.
-"""
+"""Parameters of the nodes: source of descriptors, checks, --help, tables of docs."""
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from itertools import pairwise
-from pathlib import Path
 from typing import Any, ClassVar
 
 from sst_ros.control.law import ControlChannel, ControllerSettings
 from sst_ros.dynamics.reactions import LINK_JOINTS
-from sst_ros.errors import Check, refuse_errors, refuse_unless, suggestion
-from sst_ros.removed import REMOVED_ARGUMENTS
 from sst_ros.runtime.torque_input import RunSettings
 from sst_ros.scene.scene import share_directory
-from sst_ros.scene.schema import FULL_TURN, Rules, Section, Spec, accept, choice, entry
-from sst_ros.scene.yaml_document import read_file, read_values
+from sst_ros.scene.schema import FULL_TURN, Rules, Section, choice, entry
 from sst_ros.simulation.simulation import EQUATIONS, INTEGRATORS
 from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Vector3
 
@@ -38,7 +24,7 @@ _number = partial(entry, least=0.0, most=1e6)
 _positive = partial(entry, above=0.0, most=1.0)
 
 
-def _whole(doc: str, unit: str, default: int, least: int, most: int) -> Any:
+def _integer(doc: str, unit: str, default: int, least: int, most: int) -> Any:
     return entry(doc, unit, default=default, least=least, most=most)
 
 
@@ -61,10 +47,10 @@ class SimulatorParameters(NodeParameters):
     )
 
     scene: str = entry("scene, by name or by path of a .yaml file", default="example2")
-    rate: int = _whole(
+    rate: int = _integer(
         "steps per second of simulated time, a divisor of 1e9", "Hz", 1000, 1, 10**5
     )
-    publish_rate: int = _whole(
+    publish_rate: int = _integer(
         "published samples per second of simulated time, a divisor of rate",
         "Hz",
         500,
@@ -132,7 +118,7 @@ class SimulatorParameters(NodeParameters):
         " about 20 times slower",
         EQUATIONS,
     )
-    encoder_counts: int = _whole(
+    encoder_counts: int = _integer(
         "steps per turn of the encoders that joint_states come from, whose rates are"
         " differences of angles; 0 for exact angles and rates",
         "1",
@@ -153,7 +139,7 @@ class SimulatorParameters(NodeParameters):
         0.0,
         most=1e3,
     )
-    measurement_delay: int = _whole(
+    measurement_delay: int = _integer(
         "samples by which the angles and rates of joint_states are late", "1", 0, 0, 100
     )
     dropped_samples: float = entry(
@@ -163,7 +149,7 @@ class SimulatorParameters(NodeParameters):
         least=0.0,
         most=0.99,
     )
-    measurement_seed: int = _whole(
+    measurement_seed: int = _integer(
         "seed of the noise, and of the samples that are dropped", "1", 0, 0, 2**31 - 1
     )
     imu: bool = entry(
@@ -204,7 +190,7 @@ class SimulatorParameters(NodeParameters):
         least=-1e6,
         most=1e6,
     )
-    realtime_priority: int = _whole(
+    realtime_priority: int = _integer(
         "SCHED_FIFO priority of the run's thread where that is permitted, the other"
         " threads of the node get half of it; 0 for none",
         "1",
@@ -212,7 +198,7 @@ class SimulatorParameters(NodeParameters):
         least=0,
         most=99,
     )
-    cpu_dma_latency: int = _whole(
+    cpu_dma_latency: int = _integer(
         "largest exit latency of idle states that the machine is asked to use during a"
         " run with deadlines, where /dev/cpu_dma_latency may be written; with 0 no core"
         " sleeps, which wakes the run earlier and costs power; -1 for no limit",
@@ -224,13 +210,18 @@ class SimulatorParameters(NodeParameters):
 
     def rules(self) -> Rules:
         """Refuse rates that have no whole period, and bounds too small to be meant."""
-        rate, shown = self.rate, self.publish_rate
-        whole = "must divide 1e9, so that a step is whole nanoseconds"
-        yield NANOSECONDS % rate, "rate", rate, whole
-        yield rate % shown, "publish_rate", shown, f"must divide rate = {rate}"
+        rate, publish_rate = self.rate, self.publish_rate
+        divides_second = "must divide 1e9, so that a step is whole nanoseconds"
+        yield NANOSECONDS % rate, "rate", rate, divides_second
+        yield (
+            rate % publish_rate,
+            "publish_rate",
+            publish_rate,
+            f"must divide rate = {rate}",
+        )
         waits = self.sync == "lockstep" and self.dropped_samples
-        allowed = "must be 0 in lockstep, where each sample is answered"
-        yield waits, "dropped_samples", self.dropped_samples, allowed
+        requirement = "must be 0 in lockstep, where each sample is answered"
+        yield waits, "dropped_samples", self.dropped_samples, requirement
         for name in ("real_time_factor", "command_timeout", "lockstep_timeout"):
             value = getattr(self, name)
             yield 0.0 < value < 1e-3, name, value, "must be 0 or >= 0.001"
@@ -269,7 +260,7 @@ class SimulatorParameters(NodeParameters):
 class AnsweringParameters(NodeParameters):
     """Parameters of the nodes that answer joint states with torques."""
 
-    rate: int = _whole(
+    rate: int = _integer(
         "commands per second of simulated time, a divisor of 1e9: publish_rate of the"
         " simulator",
         "Hz",
@@ -281,7 +272,7 @@ class AnsweringParameters(NodeParameters):
     stamped: bool = entry(
         "answer on commands_stamped, which lockstep needs", default=False
     )
-    min_subscribers: int = _whole(
+    min_subscribers: int = _integer(
         "least number of subscribers of the commands, before which none is sent",
         "1",
         1,
@@ -293,8 +284,8 @@ class AnsweringParameters(NodeParameters):
     def rules(self) -> Rules:
         """Refuse a rate without a whole period."""
         yield from super().rules()
-        whole = "must divide 1e9, so that a period is whole"
-        yield NANOSECONDS % self.rate, "rate", self.rate, whole
+        requirement = "must divide 1e9, so that a period is whole"
+        yield NANOSECONDS % self.rate, "rate", self.rate, requirement
 
     @property
     def period_ns(self) -> int:
@@ -417,18 +408,13 @@ class ViewerParameters(NodeParameters):
         " reach it",
         default="127.0.0.1",
     )
-    port: int = _whole(
+    port: int = _integer(
         "port of the page; the next free one is taken", "1", 8080, 1024, 65535
     )
     open: bool = entry(
         "open the page in a browser, where there is a desktop", default=False
     )
 
-
-LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
-USE_SIM_TIME = "use_sim_time"
-FOREIGN = (USE_SIM_TIME, "start_type_description_service", "qos_overrides.")
-"""Parameters (or their beginning) that rclpy itself declares."""
 
 NODE_COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
     "simulator": ("Simulator", SimulatorParameters),
@@ -438,166 +424,3 @@ NODE_COMMANDS: dict[str, tuple[str, type[NodeParameters]]] = {
     "viewer": ("Viewer", ViewerParameters),
 }
 """Class in `nodes.COMMAND` that does the work of sst_COMMAND, and its parameters."""
-
-
-def make_parser(command: str) -> argparse.ArgumentParser:
-    """Make the parser of plain options.
-
-    It leaves words to be checked, so that all are.
-    """
-    parser = argparse.ArgumentParser(
-        prog=command,
-        usage="%(prog)s [--PARAMETER VALUE ...] [--ros-args ROS_ARGUMENT ...]",
-        description=(
-            f"Node sst_{command}. Parameters, also as `--ros-args -p NAME:=VALUE`:"
-        ),
-        add_help=False,
-        allow_abbrev=False,
-        argument_default=argparse.SUPPRESS,
-    )
-    defaults = NODE_COMMANDS[command][1]()
-    for name, spec in _specs_of(command).items():
-        value = getattr(defaults, name, False)
-        shown = json.dumps(value) if isinstance(value, (bool, tuple)) else value
-        text = f"{spec.doc}; {spec.describe()}; default: {shown}".replace("%", "%%")
-        word = "true" if spec.kind == "flag" else ""  # of an option without a value
-        parser.add_argument(
-            _option(name), nargs="?", const=word, metavar="VALUE", help=text
-        )
-    return parser
-
-
-def ros_arguments(command: str, words: Sequence[str]) -> list[str]:
-    """Return the words (without the program's name) as ROS arguments.
-
-    An InputError lists every plain option, value and name of a parameter that is
-    refused.
-    """
-    known, plain, ros = _specs_of(command), list[str](), list[str]()
-    here = plain
-    for word in words:  # as rcl sorts them
-        if word == "--ros-args":
-            here = ros
-        elif word == "--" and here is ros:
-            here = plain
-        else:
-            here.append(word)
-    # A parameter is an option by its name, too: --publish_rate.
-    dashed = [
-        re.sub("^--[^=]*", lambda m: m[0].replace("_", "-"), word) for word in plain
-    ]
-    given, unknown = make_parser(command).parse_known_args(dashed)
-    named = [re.split("[=:]", word)[0] for word in unknown]
-    checks = [unknown_name(word, map(_option, known)) for word in named]
-    for flag, rule in pairwise(ros):
-        name = rule.partition(":=")[0].rpartition(":")[2]
-        if (
-            flag in ("-p", "--param")
-            and name not in known
-            and not name.startswith(FOREIGN)
-        ):
-            checks.append(unknown_name(name, known))
-        if flag == "--log-level":
-            level = rule.rpartition(":=")[2]
-            allowed = f"must be one of {', '.join(LOG_LEVELS)}"
-            checks.append((flag, level, level.lower() in LOG_LEVELS, allowed))
-    options: list[str] = []
-    for name, word in vars(given).items():
-        spec = known[name]
-        try:
-            options += ["-p", f"{name}:={_as_yaml(spec, word)}"]
-        except ValueError:
-            needs = "" if word else "needs a value, which "
-            checks.append((_option(name), word or None, False, needs + spec.describe()))
-    refuse_unless(command, *checks)
-    return ["--ros-args", *ros, *options] if ros or options else []
-
-
-def unknown_name(name: str, known: Iterable[str]) -> Check:
-    """Return the failed check of a name that is no parameter or option."""
-    names = [*known]
-    advice = REMOVED_ARGUMENTS.get(name.lstrip("-"))
-    if advice is not None:
-        return "parameter", name, False, advice
-    near = suggestion(name, names) or f"; known are {', '.join(names)}"
-    behind = ", unless behind --ros-args" if name.startswith("-") else ""
-    return (
-        "argument" if behind else "parameter",
-        name,
-        False,
-        f"is no parameter of the node{behind}{near}",
-    )
-
-
-def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:
-    """Yield a line for each parameter file without parameters for this node.
-
-    The node is given by its full name. The files are those that rcl has read from the
-    ROS arguments.
-    """
-    for path in (path for flag, path in pairwise(ros) if flag == "--params-file"):
-        allowed = "must be a readable file"
-        with refuse_errors(node, "--params-file", path, allowed, OSError, ValueError):
-            text = read_file(Path(path))
-        patterns = [*_nodes_of(read_values(text, path))]
-        # ** stands for any number of names, * for one.
-        forms = [re.escape(one).replace(r"/\*\*", "(/[^/]+)*") for one in patterns]
-        if not any(
-            re.fullmatch(form.replace(r"/\*", "/[^/]+"), node) for form in forms
-        ):
-            names = ", ".join(patterns) or "none"
-            yield (
-                f"{path} has no parameters for {node}, only for {names} (/** is any"
-                " node)"
-            )
-
-
-def _nodes_of(tree: Any, prefix: str = "") -> Iterator[str]:
-    """Yield the names of the nodes that a parameter file has parameters for."""
-    for key, inner in tree.items() if isinstance(tree, dict) else ():
-        if key == "ros__parameters":
-            yield prefix
-        else:
-            yield from _nodes_of(inner, f"{prefix}/{key.strip('/')}")
-
-
-def _specs_of(command: str) -> dict[str, Spec]:
-    return {
-        **NODE_COMMANDS[command][1].SPECS,
-        USE_SIM_TIME: Spec("flag", "follow /clock"),
-    }
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def _as_yaml(spec: Spec, word: str) -> str:
-    """Return a value as rcl reads it, or raise ValueError."""
-    value: Any = word.strip()
-    if spec.shape or spec.kind == "texts":
-        value = _read_list(value)
-    text = json.dumps(accept(spec, value), ensure_ascii=False)
-    # YAML 1.1 reads 1e-9 as text.
-    return (
-        re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text) if spec.kind == "number" else text
-    )
-
-
-def _read_list(word: str) -> list[str]:
-    """Read a list with or without brackets.
-
-    Its entries may be quoted as in JSON or YAML.
-    """
-    inner = word.strip()
-    if inner.startswith("[") and inner.endswith("]"):
-        inner = inner[1:-1]
-    entries = [entry.strip() for entry in inner.split(",")]
-    return [
-        (
-            entry[1:-1]
-            if len(entry) > 1 and entry[0] == entry[-1] and entry[0] in "\"'"
-            else entry
-        )
-        for entry in entries
-    ]

@@ -76,7 +76,7 @@ class Pacer:
             source,
             tolerance_ns,
         )
-        self._anchor = self._count = self._seen = 0
+        self._anchor = self._count = self._last_seen_ns = 0
         self._set(speed)
         self.missed = self.overruns = 0  # ticks dropped, and times that some were
         self.jumps = 0  # of the clock, back
@@ -84,7 +84,7 @@ class Pacer:
 
     def start(self) -> None:
         """Begin now; the first deadline is one period away."""
-        self._anchor = self._seen = self._source.now_ns()
+        self._anchor = self._last_seen_ns = self._source.now_ns()
         self._count = 1
 
     def change(self, speed: float) -> None:
@@ -121,13 +121,13 @@ class Pacer:
             return not interrupted()
         due, slept = self._due(ticks), False
         while True:
-            now = self._source.now_ns()
-            if now < self._seen:
+            now_ns = self._source.now_ns()
+            if now_ns < self._last_seen_ns:
                 self.jumps += 1
                 self.start()
-                now, due = self._anchor, self._due(ticks)
-            self._seen = now
-            if (late := now - due) >= 0:
+                now_ns, due = self._anchor, self._due(ticks)
+            self._last_seen_ns = now_ns
+            if (late := now_ns - due) >= 0:
                 break
             if slept and interrupted():
                 return False
@@ -253,12 +253,12 @@ class HeldTorques:
         lost = add(axpy(1.0, last, -1.0, first), drift)
         # How much the body acceleration changes by a change of the torques.
         state, dynamics = simulation.state, simulation.dynamics
-        y, rest = (
+        y, other_inputs = (
             (*state.quaternion, *state.body_rate),
             (0.0,) * (len(dynamics.drive) - 3),
         )
         without, by_late, by_lost = (
-            dynamics.derivative(*y, *torque, *rest)[4:7]
+            dynamics.derivative(*y, *torque, *other_inputs)[4:7]
             for torque in (ZERO, late, lost)
         )
         of_start = 0.5 * period * math.dist(by_late, without)
@@ -341,11 +341,11 @@ class TickLoop:
 
     def begin(self) -> bool:
         """Publish the first sample; False as long as a followed clock has no time."""
-        now = self._output.now_ns()
-        if now == 0:
+        now_ns = self._output.now_ns()
+        if now_ns == 0:
             return False
         sample = self._stamp_ns + self._control_ns
-        self._start_ns = max(now + self._idle_step_ns, sample, self._idle_ns + 1)
+        self._start_ns = max(now_ns + self._idle_step_ns, sample, self._idle_ns + 1)
         self.begun = True
         self._publish()
         return True
@@ -408,11 +408,11 @@ class TickLoop:
                 ticks += unread * self._ticks_per_sample
             if paced and not self._pacer.wait(self._is_interrupted, ticks):
                 return False
-            now = time.monotonic_ns()
+            now_ns = time.monotonic_ns()
             while ticks:
-                begins = now - (ticks - 1) * interval_ns
+                begins = now_ns - (ticks - 1) * interval_ns
                 torque = self._kept or self._input.torque(self.simulation, begins)
-                equal = ticks if self._kept or self._input.constant(now) else 1
+                equal = ticks if self._kept or self._input.constant(now_ns) else 1
                 self._advance(torque, equal)
                 ticks -= equal
             self.counters.published += unread
@@ -480,12 +480,12 @@ class TickLoop:
             simulation.advance(torque, self._period_ns, ticks, moment)
         finally:
             took = time.perf_counter() - began
-            done = (simulation.time_ns - before) // self._period_ns
-            if done:
-                self.counters.count(took, self._pacer.late_ns, done)
-                self._output.ticks(torque, moment, done)
-                self.held.add(torque, 1e-9 * done * self._period_ns)
-                self._tick += done
+            ticks_done = (simulation.time_ns - before) // self._period_ns
+            if ticks_done:
+                self.counters.count(took, self._pacer.late_ns, ticks_done)
+                self._output.ticks(torque, moment, ticks_done)
+                self.held.add(torque, 1e-9 * ticks_done * self._period_ns)
+                self._tick += ticks_done
 
     def _answer(self, paced: bool) -> Vector3 | None:
         """Torques that answer the last sample; None if interrupted before."""

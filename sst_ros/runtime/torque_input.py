@@ -97,7 +97,7 @@ class TorqueInput:
         self._forget()
 
     def _forget(self) -> None:
-        self._held = self.moment = ZERO  # torques; external moment in {B} [N m]
+        self._torque = self.moment = ZERO  # torques; external moment in {B} [N m]
         self.begun = False  # a command has come since the start
         self.stale = False  # the last one is older than command_timeout and not used
         self.last_refusal = ""
@@ -156,7 +156,7 @@ class TorqueInput:
         self.timeouts += old and not self.stale
         self.stale = old
         if not old:
-            return self._held
+            return self._torque
         if not self._damping:
             return ZERO
         first, second, third = simulation.state.joints.gamma_dot
@@ -170,7 +170,7 @@ class TorqueInput:
         shown before the run is looked for. In a run such answers are ignored, because
         they may arrive late. In a pause the state of the sample is shown again.
         """
-        found: Vector3 | None = None
+        torque: Vector3 | None = None
         for _ in self._commands.read(math.inf):
             self._drop(
                 MessageRefused("no stamp", "in lockstep only commands_stamped is used")
@@ -181,13 +181,13 @@ class TorqueInput:
             to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
             behind = stamp - (stamp_ns or 0)
             fits = to_idle if stamp_ns is None else 0 <= behind < self._run.period_ns
-            if found is None and fits:
-                found = self._accept(torque_by_name, message, now_ns)
+            if torque is None and fits:
+                torque = self._accept(torque_by_name, message, now_ns)
             elif not to_idle:
                 reason = f"stamp {stamp} ns answers no sample that waits"
                 self._drop(MessageRefused("stamp", reason))
         self._take_moments(now_ns)
-        return found
+        return torque
 
     def _take(self, now_ns: int) -> None:
         for message in self._commands.read(now_ns):
@@ -201,19 +201,19 @@ class TorqueInput:
 
         With partial_commands nan is zero torque, all nan no command.
         """
-        found: Sequence[Any] = self._stamped.read(until_ns)
+        received: Sequence[Any] = self._stamped.read(until_ns)
         if not self._run.partial_commands:
-            return found
-        given = [
-            one
-            for one in found
-            if not (one.effort and all(map(math.isnan, one.effort)))
+            return received
+        commands = [
+            command
+            for command in received
+            if not (command.effort and all(map(math.isnan, command.effort)))
         ]
-        for message in given:
+        for message in commands:
             message.effort = [
                 0.0 if math.isnan(torque) else torque for torque in message.effort
             ]
-        return given
+        return commands
 
     def _take_moments(self, now_ns: int) -> None:
         if self._moments is None:
@@ -251,11 +251,11 @@ class TorqueInput:
         except MessageRefused as refused:
             self._drop(refused)
             return None
-        self._held = clamp(torque, self._limit)
-        self.clamped += self._held != torque
+        self._torque = clamp(torque, self._limit)
+        self.clamped += self._torque != torque
         self.received += 1
         self._since, self.begun = now_ns, True
-        return self._held
+        return self._torque
 
     def _drop(self, refused: MessageRefused) -> None:
         self.dropped += 1
@@ -266,11 +266,13 @@ class TorqueInput:
         return 0.0 < self._run.command_timeout_ns < now_ns - since_ns
 
 
-def three_numbers(data: Sequence[float], what: str = "torques [N m]") -> Vector3:
+def three_numbers(data: Sequence[float], quantity: str = "torques [N m]") -> Vector3:
     """Return three finite numbers, or raise MessageRefused."""
     if (vector := finite_vector(data)) is None:
-        kind = "not finite" if len(data) == 3 else "wrong size"
-        raise MessageRefused(kind, f"{_shorten(data)} must be 3 finite {what}")
+        reason_key = "not finite" if len(data) == 3 else "wrong size"
+        raise MessageRefused(
+            reason_key, f"{_shorten(data)} must be 3 finite {quantity}"
+        )
     return vector
 
 
@@ -279,16 +281,16 @@ def torque_by_name(message: Any) -> Vector3:
     return by_name(message.name, message.effort, "torques [N m] in effort")
 
 
-def by_name(names: Sequence[str], values: Sequence[float], what: str) -> Vector3:
+def by_name(names: Sequence[str], values: Sequence[float], quantity: str) -> Vector3:
     """Return a value for each actuator, gamma_1 to gamma_3, given in any order."""
     if sorted(names) != list(ACTUATED_JOINTS):
-        allowed = ", ".join(ACTUATED_JOINTS)
-        reason = f"names {_shorten(names)} must be {allowed}, each once"
+        joint_names = ", ".join(ACTUATED_JOINTS)
+        reason = f"names {_shorten(names)} must be {joint_names}, each once"
         raise MessageRefused("wrong names", reason)
     if len(values) == 3:
-        at = dict(zip(names, values, strict=True))
-        values = [at[name] for name in ACTUATED_JOINTS]
-    return three_numbers(values, what)
+        value_of = dict(zip(names, values, strict=True))
+        values = [value_of[name] for name in ACTUATED_JOINTS]
+    return three_numbers(values, quantity)
 
 
 def _shorten(values: Sequence[Any]) -> str:

@@ -54,8 +54,11 @@ class Order:
 
     """
 
-    def __init__(self, points: Points, seen: Measurement | None, seen_ns: int) -> None:
-        self.points, self.seen, self.seen_ns = points, seen, seen_ns
+    def __init__(
+        self, points: Points, measured: Measurement | None, seen_ns: int
+    ) -> None:
+        self.points = points
+        self.measured, self.seen_ns = measured, seen_ns
         self.outcome: Future[None] = Future()
         # checks, and the sample at the last one
         self.passed, self.asked, self.asked_ns = 0.0, 0, 0
@@ -137,23 +140,25 @@ class TrajectoryFollower:
         if self._planned is not None:
             self._prepare(self._planned)
 
-    def take(self, message: Any, seen: Measurement | None, seen_ns: int = 0) -> Order:
+    def take(
+        self, message: Any, measured: Measurement | None, seen_ns: int = 0
+    ) -> Order:
         """Take a trajectory_msgs/JointTrajectory in place of what is followed now.
 
         It goes on from the reference that is followed then; before the first sample
-        from where the manipulator was `seen` last, at rest. Where it is refused,
+        from where the manipulator was `measured` last, at rest. Where it is refused,
         nothing changes.
         """
-        motion, allowed = (
+        motion, requirement = (
             self._settings.motion,
             "must be topic, for trajectories to be taken",
         )
         refuse_unless(
-            "joint_trajectory", ("motion", motion, motion == "topic", allowed)
+            "joint_trajectory", ("motion", motion, motion == "topic", requirement)
         )
         is_partial_allowed = self._settings.allow_partial_joints_goal
         points = read_points(message, is_partial_allowed=is_partial_allowed)
-        order = Order(points, seen, seen_ns)
+        order = Order(points, measured, seen_ns)
         if self._waiting is not None:
             self._waiting.outcome.cancel()
         self._waiting = order
@@ -177,14 +182,14 @@ class TrajectoryFollower:
                 order, self._waiting = self._waiting, None
                 assert order is not None
                 try:
-                    given = order.points, *self._place(order)
+                    arguments = order.points, *self._place(order)
                     if self._assistant is None:
-                        self._follow(order, self._plan(*given))
+                        self._follow(order, self._plan(*arguments))
                         continue
                 except SstError as error:
                     order.outcome.set_exception(error)
                     continue
-                self._assistant.call(*given)
+                self._assistant.call(*arguments)
                 self._checked = order
             assert self._assistant is not None
             if (result := self._assistant.result()) is None:
@@ -204,7 +209,7 @@ class TrajectoryFollower:
         now_ns = self._last_ns + self._settings.period_ns
         effort: Vector3 | None = None
         if self._last is None:
-            order.begin = self._reference_at_rest(order.seen)
+            order.begin = self._reference_at_rest(order.measured)
             now_ns = order.seen_ns
         elif stamp_ns == 0 and self._rests():
             order.begin = self._motion.at(math.inf)
@@ -256,7 +261,9 @@ class TrajectoryFollower:
 
     def has(self, order: Order) -> bool:
         """Whether the trajectory is followed, or will be at its stamp."""
-        return order is self.order or any(order is one for _, _, one in self._upcoming)
+        return order is self.order or any(
+            order is upcoming for _, _, upcoming in self._upcoming
+        )
 
     def _rests(self) -> bool:
         """Whether the reference stands still from now on."""
@@ -283,7 +290,9 @@ class TrajectoryFollower:
                 self._prepare(motion, order)
         else:
             start_ns = order.begin_ns or self._last_ns + self._settings.period_ns
-            self._upcoming = [one for one in self._upcoming if one[0] < start_ns]
+            self._upcoming = [
+                upcoming for upcoming in self._upcoming if upcoming[0] < start_ns
+            ]
             self._upcoming.append((start_ns, motion, order))
         order.outcome.set_result(None)
 
@@ -399,25 +408,28 @@ class TrajectoryFollower:
             self._metrics.add(track_of(self._rows))
             self._rows = array("d")
 
-    def _reference_at_rest(self, seen: Measurement | None) -> Reference:
+    def _reference_at_rest(self, measured: Measurement | None) -> Reference:
         """Return the reference at rest at the measured angles."""
-        if seen is None:
-            allowed = "must come first: a trajectory begins there"
-            raise refusal("joint_trajectory", "joint_states", None, allowed)
+        if measured is None:
+            requirement = "must come first: a trajectory begins there"
+            raise refusal("joint_trajectory", "joint_states", None, requirement)
         named = self._model.initial.orientation
         meant = None if named is None else rotation_matrix(named)
-        assembly = kinematics.admissible(self._geometry, seen.gamma, meant)
+        assembly = kinematics.admissible(self._geometry, measured.gamma, meant)
         x, y, z, w = quaternion_of(assembly.rotation).tolist()
-        return Reference((x, y, z, w), ZERO, ZERO, seen.gamma, ZERO, ZERO)
+        return Reference((x, y, z, w), ZERO, ZERO, measured.gamma, ZERO, ZERO)
 
     def _refuse_elsewhere(self, measured: Measurement) -> None:
         begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance
-        near = max(map(abs, axpy(1.0, begin, -1.0, measured.gamma))) <= tolerance
-        said = ", ".join(f"{angle:.6f}" for angle in begin)
-        allowed = (
-            f"must be within {tolerance:g} rad of ({said}), where the motion begins"
+        is_near = max(map(abs, axpy(1.0, begin, -1.0, measured.gamma))) <= tolerance
+        begin_text = ", ".join(f"{angle:.6f}" for angle in begin)
+        requirement = (
+            f"must be within {tolerance:g} rad of ({begin_text}), where the motion"
+            " begins"
         )
-        refuse_unless("joint_states", ("position", measured.gamma, near, allowed))
+        refuse_unless(
+            "joint_states", ("position", measured.gamma, is_near, requirement)
+        )
 
 
 def _read_motion(bag: str, namespace: str | None) -> Trajectory:

@@ -52,16 +52,18 @@ def read_points(message: Any, *, is_partial_allowed: bool = False) -> Points:
     """
     names = list(message.joint_names)
     is_known = sorted(names) == list(ACTUATED_JOINTS)
-    allowed = f"must be {', '.join(ACTUATED_JOINTS)}, each once"
+    requirement = f"must be {', '.join(ACTUATED_JOINTS)}, each once"
     if is_partial_allowed:
         is_known = 0 < len(names) == len({*names} & {*ACTUATED_JOINTS})
-        allowed = f"must be some of {', '.join(ACTUATED_JOINTS)}, each once"
+        requirement = f"must be some of {', '.join(ACTUATED_JOINTS)}, each once"
     elif set(names) < set(ACTUATED_JOINTS):
-        allowed += ", or allow_partial_joints_goal true"
-    refuse_unless("joint_trajectory", ("joint_names", names, is_known, allowed))
+        requirement += ", or allow_partial_joints_goal true"
+    refuse_unless("joint_trajectory", ("joint_names", names, is_known, requirement))
     legs = [leg for leg, name in enumerate(ACTUATED_JOINTS) if name in names]
     places = [names.index(ACTUATED_JOINTS[leg]) for leg in legs]
-    whole = f"must be {len(names)} finite numbers, one for each of joint_names"
+    row_requirement = (
+        f"must be {len(names)} finite numbers, one for each of joint_names"
+    )
     checks: list[Check] = []
 
     def rows_of(quantity: str) -> list[list[float]]:
@@ -70,7 +72,7 @@ def read_points(message: Any, *, is_partial_allowed: bool = False) -> Points:
         for index, point in enumerate(message.points):
             row = [float(number) for number in getattr(point, quantity)]
             fits = len(row) in (0, len(names))
-            checks.append((f"points[{index}].{quantity}", row, fits, whole))
+            checks.append((f"points[{index}].{quantity}", row, fits, row_requirement))
             rows.append([row[place] for place in places] if row and fits else row)
         return rows
 
@@ -81,8 +83,8 @@ def read_points(message: Any, *, is_partial_allowed: bool = False) -> Points:
     if any(efforts):
         for index, row in enumerate(efforts):
             fits = len(row) > 0 and all(map(math.isfinite, row))
-            said = f"{whole}, or none in any point"
-            checks.append((f"points[{index}].effort", row, fits, said))
+            effort_requirement = f"{row_requirement}, or none in any point"
+            checks.append((f"points[{index}].effort", row, fits, effort_requirement))
     else:
         efforts = []
     refuse_unless("joint_trajectory", *checks)
@@ -162,17 +164,17 @@ def _points_ahead(points: Points, passed: float) -> Points:
     )
 
 
-def _fill_in(row: list[float], legs: list[int], others: Vector3) -> list[float]:
+def _fill_in(row: list[float], legs: list[int], defaults: Vector3) -> list[float]:
     """Return a row of all legs, with the numbers of those that are not in it.
 
     Open if empty.
     """
     if not row:
         return row
-    whole = list(others)
+    all_legs = list(defaults)
     for leg, number in zip(legs, row, strict=True):
-        whole[leg] = number
-    return whole
+        all_legs[leg] = number
+    return all_legs
 
 
 def _interpolate(times: Array, rows: Array, time: float) -> Vector3:
@@ -205,12 +207,12 @@ class TrajectoryGoal:
             "component_path_tolerance",
             "component_goal_tolerance",
         )
-        rows, allowed = (
+        rows, requirement = (
             attrgetter(*names)(message),
             "must be empty: joints have one freedom",
         )
         self._checks: list[Check] = [
-            (name, f"{len(x)} entries", not x, allowed)
+            (name, f"{len(x)} entries", not x, requirement)
             for name, x in zip(names, rows, strict=True)
         ]
         self._path = self._resolve_all(
@@ -237,30 +239,32 @@ class TrajectoryGoal:
         0 where there is none.
         """
         own = {"position": position, "velocity": velocity}
-        found = {
+        tolerances = {
             (quantity, joint): own[quantity]
             for quantity in own
             for joint in ACTUATED_JOINTS
         }
         for index, tolerance in enumerate(getattr(message, name)):
             place = f"{name}[{index}]"
-            known, allowed = (
+            is_joint, requirement = (
                 tolerance.name in ACTUATED_JOINTS,
                 f"must be one of {', '.join(ACTUATED_JOINTS)}",
             )
-            self._checks.append((f"{place}.name", tolerance.name, known, allowed))
+            self._checks.append(
+                (f"{place}.name", tolerance.name, is_joint, requirement)
+            )
             for quantity, default in own.items():
                 value = getattr(tolerance, quantity)
                 resolved = self._resolve(f"{place}.{quantity}", value, default)
-                found[quantity, tolerance.name] = resolved
-        return found
+                tolerances[quantity, tolerance.name] = resolved
+        return tolerances
 
     def _resolve(self, name: str, value: float, default: float) -> float:
-        none, allowed = (
+        none, requirement = (
             value == NO_TOLERANCE,
             "must be > 0, 0 for the default or -1 for none",
         )
-        self._checks.append((name, value, none or 0.0 <= value < math.inf, allowed))
+        self._checks.append((name, value, none or 0.0 <= value < math.inf, requirement))
         return 0.0 if none else value or default
 
     def index(self, time: float) -> int:
@@ -276,15 +280,17 @@ class TrajectoryGoal:
         [rad/s].
         """
         late = time - self._times[-1]
-        kind, tolerances = ("path", self._path) if late < 0.0 else ("goal", self._goal)
+        stretch, tolerances = (
+            ("path", self._path) if late < 0.0 else ("goal", self._goal)
+        )
         errors, unmet = (*error, *error_rate), ""
-        for ((quantity, joint), allowed), off in zip(
+        for ((quantity, joint), tolerance), off in zip(
             tolerances.items(), errors, strict=True
         ):
-            if allowed and not abs(off) <= allowed:
+            if tolerance and not abs(off) <= tolerance:
                 unit = "rad" if quantity == "position" else "rad/s"
-                words = f"{kind} tolerance {allowed:g} {unit}"
-                unmet = f"{joint}: {quantity} error {off:.6g} {unit}, {words}"
+                violated = f"{stretch} tolerance {tolerance:g} {unit}"
+                unmet = f"{joint}: {quantity} error {off:.6g} {unit}, {violated}"
                 break
         if late < 0.0:
             return (ErrorCode.PATH_TOLERANCE_VIOLATED, unmet) if unmet else None

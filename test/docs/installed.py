@@ -13,7 +13,8 @@ from docs.blocks import ROOT
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.nodes.topics import EXECUTES, PUBLISHES, SERVES, SUBSCRIBES
-from sst_ros.runtime.settings import NODE_COMMANDS, ros_arguments
+from sst_ros.runtime.arguments import ros_arguments
+from sst_ros.runtime.settings import NODE_COMMANDS
 from tools.reference_pages import NODES
 
 ENDPOINTS = {

@@ -9,12 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sst_ros.errors import InputError
-from sst_ros.runtime.settings import (
-    NODE_COMMANDS,
-    make_parser,
-    ros_arguments,
-    unused_files,
-)
+from sst_ros.runtime.arguments import make_parser, ros_arguments, unused_files
+from sst_ros.runtime.settings import NODE_COMMANDS
 
 
 def values(command, *words):

@@ -8,7 +8,7 @@ import pytest
 
 from sst_ros.errors import InputError
 from sst_ros.recording.bag_reader import Bag
-from sst_ros.runtime.settings import unused_files
+from sst_ros.runtime.arguments import unused_files
 from sst_ros.scene.scene import load
 from sst_ros.sweeps.sweep_study import SweepStudy
 
