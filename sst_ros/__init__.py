@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sst_ros.integration.batch import Batch as Batch
     from sst_ros.mechanism import kinematics as _kinematics
     from sst_ros.mechanism.geometry import Geometry as Geometry
-    from sst_ros.mechanism.workspace import (
+    from sst_ros.mechanism.nearest_singularity import (
         distance_to_singularity as distance_to_singularity,
     )
     from sst_ros.mechanism.workspace import workspace as workspace
@@ -79,7 +79,8 @@ _MODULES = {
     "integration.batch": "Batch",
     "mechanism.geometry": "Geometry",
     "mechanism.kinematics": "direct_kinematics:direct inverse_kinematics:inverse",
-    "mechanism.workspace": "distance_to_singularity workspace",
+    "mechanism.nearest_singularity": "distance_to_singularity",
+    "mechanism.workspace": "workspace",
     "plot.workspace": "plot_workspace plot_zone",
     "proof.certify": "ProvenMotion certify",
     "proof.zones": "ProvenZone certify_zone",

@@ -65,6 +65,7 @@ def made(bag):
         geometry,
         measures(geometry, gamma, rotation),
         distance_to_singularity(scene, gamma),
+        distance_to_singularity(scene, [gamma, gamma]),
     )
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,18 +23,12 @@ from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
 from sst_ros.progress import slices
-from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import Explained
 
 BLOCK = 20_000  # poses that are measured at a time
 BISECTIONS = 55  # of psi between two samples: to rounding
 MOST_POSES = 20_000_000  # of a map: 4 GB
 SMOOTH = 1.0  # change of gamma [rad] between two samples that is no jump by pi
-
-RAYS = 400  # from a pose, along which det J2 is looked at
-RAY_POINTS = 64
-REFINED = 6  # nearest changes of sign that are refined
-FOUND = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 
 
 @dataclass(frozen=True, repr=False)
@@ -331,110 +324,6 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
         rows.append((rotation[kept], gamma[kept], beta[kept], leg[kept], c[kept]))
     arrays = [np.concatenate(column) for column in zip(*rows, strict=True)]
     return SingularPoses("serial", *frozen(*arrays))
-
-
-@dataclass(frozen=True, repr=False)
-class NearestSingularity(Explained):
-    """The singular pose that the least turn of the star reaches; read-only arrays."""
-
-    kind: str  #: "parallel" or "serial"
-    leg: int  #: index k of the singular leg; -1 of a parallel one, which involves all
-    distance: float  #: angle of the turn [rad]
-    axis: Array  #: of the turn, in {E}, shape (3,)
-    rotation: Array  #: R of the singular pose, shape (3, 3)
-
-    def _facts(self) -> dict[str, object]:
-        return {
-            "kind": self.kind,
-            "leg": "all" if self.leg < 0 else self.leg + 1,
-            "turn of the star to it [rad]": self.distance,
-            "axis of the turn, in {E}": self.axis.tolist(),
-        }
-
-
-@check_kinds
-def distance_to_singularity(
-    where: SceneInput | Geometry, gamma: ArrayLike
-) -> NearestSingularity:
-    """Find the singular pose that is nearest to a pose: by the least turn of the star.
-
-    Limits of strokes and arcs are not looked at. To a serial one the distance is
-    closed: that of t_k from the line of w_k. Nearer than it det J2 is smooth: rays in
-    even directions find where it changes sign, and from the nearest of these the least
-    turn is sought. A parallel singularity is overlooked only where it comes nearer than
-    that between all rays.
-
-    Args:
-        where: a scene, as `simulate` takes it, or its geometry.
-        gamma: angles of the actuators in the one admissible assembly [rad], shape (3,).
-
-    Raises:
-        AssemblyError: there is no unique admissible assembly.
-
-    """
-    from scipy.optimize import minimize
-    from scipy.spatial.transform import Rotation
-
-    geometry = where if isinstance(where, Geometry) else Geometry.of(scene_of(where))
-    start = kinematics.admissible(geometry, gamma).rotation
-    leg, turn = _turn_to_serial(geometry, start)
-    kind = "serial"
-    longest = np.linalg.norm(turn)
-
-    def det_j2(turns: Array) -> Array:
-        # A list of vectors: SciPy before 1.16 takes no arrays of more dimensions.
-        matrices = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
-        rotation = start @ matrices.reshape(*turns.shape[:-1], 3, 3)
-        angles, _, _ = kinematics.inverse(geometry, rotation)
-        return measures(geometry, angles, rotation).det_j2
-
-    at_pose = det_j2(np.zeros(3))
-
-    def ratio(turns: Array) -> Array:
-        return det_j2(turns) / at_pose
-
-    def square(turn: Array) -> Any:
-        return turn @ turn
-
-    rays = _even_directions(RAYS)
-    lengths = np.linspace(0.0, 1.0 - 1e-9, RAY_POINTS) * longest
-    is_beyond = ratio(rays[:, None] * lengths[:, None]) <= 0.0
-    first = np.where(is_beyond.any(axis=1), is_beyond.argmax(axis=1), RAY_POINTS)
-    singular: Any = {"type": "eq", "fun": ratio}
-    limits = {"ftol": 1e-12, "maxiter": 60}
-    for row in np.argsort(first, kind="stable")[:REFINED]:
-        if first[row] == RAY_POINTS:
-            continue
-        begin = rays[row] * lengths[first[row]]
-        least = minimize(square, begin, constraints=singular, options=limits).x
-        is_singular = abs(ratio(least)) < FOUND
-        if is_singular and np.linalg.norm(least) < np.linalg.norm(turn):
-            kind, leg, turn = "parallel", -1, least
-    distance = float(np.linalg.norm(turn))
-    rotation = start @ Rotation.from_rotvec(turn).as_matrix()
-    axis = turn / distance
-    frozen(axis, rotation)
-    return NearestSingularity(kind, leg, distance, axis, rotation)
-
-
-def _turn_to_serial(geometry: Geometry, rotation: Array) -> tuple[int, Array]:
-    """Return the leg, and the least turn in {E} [rad], that bring t_k onto +-w_k."""
-    w = geometry.w @ rotation  # rows in {E}
-    cosines = np.sum(geometry.e * w, axis=1)
-    sines = np.linalg.norm(np.cross(geometry.e, w), axis=1)
-    angles = np.arctan2(sines, np.abs(cosines))
-    leg = int(angles.argmin())
-    axis = np.cross(geometry.e[leg], np.copysign(1.0, cosines[leg]) * w[leg])
-    return leg, angles[leg] * axis / np.linalg.norm(axis)
-
-
-def _even_directions(count: int) -> Array:
-    """Return unit vectors of a Fibonacci lattice on the sphere, shape (count, 3)."""
-    number = np.arange(count)
-    z = 1.0 - (2.0 * number + 1.0) / count
-    angle = np.pi * (3.0 - np.sqrt(5.0)) * number
-    radius = np.sqrt(1.0 - z * z)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
 def report_singularities(geometry: Geometry, chart: OrientationMap) -> str:

@@ -239,7 +239,7 @@ def test_many_poses_have_the_same_bits_without_llvmlite():
     assert (compiled == plain).all()
 
 
-def test_potential_energy_of_many_poses_has_torques_as_slope():
+def test_many_torques_that_hold_are_slopes_of_the_energy():
     samples_of_poses = seeded_samples(85, 2)
     for sample in samples_of_poses:
         scene = dataclasses.replace(laden(sample), friction=None)

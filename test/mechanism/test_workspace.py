@@ -12,9 +12,10 @@ from mechanism.closed_chains import FOLDING, ISOTROPIC, random_geometry, random_
 from models import assembly_of
 from scipy.spatial.transform import Rotation
 
-from sst_ros.errors import AssemblyError, SingularConfiguration
+from sst_ros.errors import AssemblyError, InputError, SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work, workspace
 from sst_ros.mechanism.geometry import zyz_angles
+from sst_ros.mechanism.nearest_singularity import distance_to_singularity
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +147,7 @@ def test_no_ray_meets_a_singularity_before_the_nearest():
             start = kinematics.admissible(geometry, gamma).rotation
         except AssemblyError:
             continue
-        found = workspace.distance_to_singularity(geometry, gamma)
+        found = distance_to_singularity(geometry, gamma)
         kinds.add(found.kind)
         turn = Rotation.from_rotvec(found.distance * found.axis)
         np.testing.assert_allclose(found.rotation, start @ turn.as_matrix(), atol=1e-12)
@@ -170,3 +171,42 @@ def test_no_ray_meets_a_singularity_before_the_nearest():
         ).as_matrix()
         dependent, sine = measure(start @ rays)
         assert np.ptp(np.sign(dependent)) == 0.0 and sine.min() > 1e-3
+
+
+@pytest.mark.parametrize("geometry", [ISOTROPIC, FOLDING], ids=["isotropic", "folding"])
+def test_nearest_to_many_poses_has_the_bits_of_each(geometry):
+    around = np.random.default_rng(8).uniform(-0.02, 0.02, (120, 3))
+    gamma = np.array([0.264, 0.721, 0.523]) + around
+    many = distance_to_singularity(geometry, gamma)
+    assert len(many) == 120
+    for near, angles in zip(many, gamma, strict=True):
+        alone = distance_to_singularity(geometry, angles)
+        assert (near.kind, near.leg) == (alone.kind, alone.leg)
+        assert near.distance == alone.distance
+        assert (near.axis == alone.axis).all()
+        assert (near.rotation == alone.rotation).all()
+    assert "120" in repr(many)
+
+
+def test_no_poses_have_no_nearest_singularity():
+    assert len(distance_to_singularity(ISOTROPIC, np.empty((0, 3)))) == 0
+
+
+@pytest.mark.parametrize(
+    ("gamma", "error", "said"),
+    [
+        ([0.8, 0.8], InputError, "three angles .rad., or rows of them"),
+        ([[0.8, 0.8]], InputError, "three angles .rad., or rows of them"),
+        (np.full((2, 2, 3), 0.8), InputError, "three angles .rad., or rows of them"),
+        ([[0.8, 0.8, 0.8], [0.8]], InputError, "gamma = "),
+        ([[0.8, 0.8, 0.8], [0.8, 0.8, np.nan]], AssemblyError, "three finite numbers"),
+        (
+            [[0.8, 0.8, 0.8], [3.0, 3.0, 0.1]],
+            AssemblyError,
+            r"= \[3\.  3\.  0\.1\]",
+        ),
+    ],
+)
+def test_gammas_without_a_nearest_singularity(gamma, error, said):
+    with pytest.raises(error, match=said):
+        distance_to_singularity(ISOTROPIC, gamma)
