@@ -99,6 +99,19 @@ def refuse_unless(origin: str, *checks: Check) -> None:
         raise InputError(origin, problems)
 
 
+def refuse_other_rounding(origin: str) -> None:
+    """Raise InputError where the processor does not round to nearest.
+
+    A library in the same process may have changed the mode (fesetround). All numbers
+    of this package, and those of Python itself, are specified for the default alone.
+    """
+    one = 1.0
+    quarter_unit = 2.0**-54
+    is_nearest = one + quarter_unit == one and one - quarter_unit == one
+    allowed = "must be to nearest, the default of IEEE 754"
+    refuse_unless(origin, ("rounding mode", "another one", is_nearest, allowed))
+
+
 @dataclass(frozen=True)
 class Kind:
     """A kind of argument: whether a value is of it, and the words of a refusal."""

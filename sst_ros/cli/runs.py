@@ -13,6 +13,7 @@ import math
 import signal
 import threading
 from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -206,12 +207,10 @@ def certify_scene(options: argparse.Namespace) -> int:
     proven = function("proof.certify:certify")(scene, torque, **choices)
     print(proven)
     if options.out is not None:
-        proven.to_pandas().to_csv(options.out, index=False)
-        print(options.out)
+        _write_in_full(proven.to_pandas(), options.out)
     if options.tracking is not None:
         table = require("pandas").DataFrame(proven.tracking)
-        table.to_csv(options.tracking, index=False)
-        print(options.tracking)
+        _write_in_full(table, options.tracking)
     return 0 if proven.success else 1
 
 
@@ -239,9 +238,17 @@ def prove_zone(options: argparse.Namespace) -> int:
         function("figures:save_figure")(figure, picture)
         print(picture)
     if target is not None:
-        zone.to_pandas().to_csv(target, index=False)
-        print(target)
+        _write_in_full(zone.to_pandas(), target)
     return 0 if zone.success else 1
+
+
+def _write_in_full(table: Any, path: Path) -> None:
+    """Write bounds as CSV, each double as the decimal number that it is.
+
+    The shortest decimal number of a double may be below it, and so below the bound.
+    """
+    table.astype(float).map(Decimal).to_csv(path, index=False)
+    print(path)
 
 
 def _zone_limits(options: argparse.Namespace) -> dict[str, Any]:

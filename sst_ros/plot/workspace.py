@@ -13,8 +13,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import BoundaryNorm, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
@@ -103,8 +104,9 @@ def _draw_row(row: Any, chart: OrientationMap, title: str) -> None:
 def plot_zone(zone: ProvenZone) -> Figure:
     """Draw what is proven of a zone on the workspace triangle.
 
-    Of a cap the torsion at each direction of E: how much of it is proven, and how much
-    is neither proven nor refuted; of a box of actuator angles the directions of E.
+    Of a cap the torsion at directions of E: how much of it is proven, and how much is
+    neither proven nor refuted. A triangle between three directions has the colour of
+    the one of which least is known. Of a box of actuator angles the directions of E.
     """
     is_zone = hasattr(zone, "turns_at")
     refuse_unless("plot_zone", ("zone", zone, is_zone, "must be of `certify_zone`"))
@@ -119,15 +121,22 @@ def plot_zone(zone: ProvenZone) -> Figure:
         s, faces = workspace.triangle_directions(geometry, ZONE_DIVISIONS)
         turns = np.degrees(zone.turns_at(s))
         panels = figure.subplots(1, 2)
-        for axes, index, title in (
-            (panels[0], 2, "Proven torsion"),
-            (panels[1], 1, "Torsion neither proven nor refuted"),
+        x, y = project(geometry, s)
+        mesh = Triangulation(x, y, faces)
+        corners = turns[faces]  # shape (triangles, 3, 3)
+        for axes, shown, title in (
+            (panels[0], corners[:, :, 2].min(axis=1), "Proven torsion, at least"),
+            (
+                panels[1],
+                corners[:, :, 1].max(axis=1),
+                "Torsion neither proven nor refuted, at most",
+            ),
         ):
-            x, y = project(geometry, s)
-            mesh = Triangulation(x, y, faces)
-            most = max(float(turns[:, index].max()), 1e-9)
+            most = max(float(shown.max()), 1e-9)
             levels = MaxNLocator(10).tick_values(0.0, most)
-            filled = axes.tricontourf(mesh, turns[:, index], levels=levels)
+            steps = BoundaryNorm(levels, len(levels) - 1)
+            colours = colormaps["viridis"].resampled(len(levels) - 1)
+            filled = axes.tripcolor(mesh, facecolors=shown, cmap=colours, norm=steps)
             bar = figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02)
             bar.set_label("deg", fontsize=9)
             axes.set_title(title, fontsize=10.5, color=INK, loc="center")

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import Any
 
-from sst_ros.errors import InputError, Problem, require
+from sst_ros.errors import refuse_other_rounding, require
 
 _flint = require("flint")
 arb, arb_mat, arb_poly, arb_series, ctx = (
@@ -37,12 +37,7 @@ def precision() -> Iterator[None]:
     Raises InputError where the processor does not round to nearest: the arithmetic of
     Python between the balls is specified for that alone.
     """
-    one, tiny = 1.0, 2.0**-53
-    if one + tiny != one or one - 0.75 * tiny == one or -one - tiny != -one:
-        problem = Problem(
-            "rounding mode", "not to nearest", "must be that of IEEE 754's default"
-        )
-        raise InputError("certify", [problem])
+    refuse_other_rounding("certify")
     with _CONTEXT_LOCK:
         before = ctx.prec, ctx.cap
         ctx.prec, ctx.cap = PRECISION, LONGEST_SERIES

@@ -681,8 +681,13 @@ def _check_tube(step: Advance, tolerance: float) -> Advance:
     pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
     if all(x.is_finite() and x < e.rad() for x, e in pairs):
         return step._replace(tube=[arb(0, x.upper()) for x in reached])
-    # Numbers of ranges do not move, but what they move counts from the first step on.
-    widest = max(map(float, entries(spread)[: step.begin.moving]))
+    # Numbers of ranges do not move, but what they move counts from the first step on:
+    # at the end of the step, as V in all of a long step is much wider than it is.
+    at_end = step.begin.spread(step.flow(step.length))
+    widest = max(
+        _largest(spread_then, step.begin.moving)
+        for spread_then in (step.begin.spread(), at_end)
+    )
     grows = max(map(float, entries(step.w)))
     is_slow = grows < 10.0 * tolerance + REMAINDER_GROWTH * widest
     wider = None
@@ -690,6 +695,11 @@ def _check_tube(step: Advance, tolerance: float) -> Advance:
         moving = [2 * x for x in reached[: step.begin.moving]]
         wider = [arb(0, x.upper()) for x in moving] + step.tube[step.begin.moving :]
     raise Refused("the error may leave the tube: it grows too fast", 0.6, wider)
+
+
+def _largest(bounds: Any, count: int) -> float:
+    """Return the largest of the first bounds of a column."""
+    return max(map(float, entries(bounds)[:count]))
 
 
 def _weights(jacobian: Any) -> list[Any]:

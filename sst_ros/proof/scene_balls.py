@@ -304,7 +304,7 @@ def _balls_of(
             refuse_unless(origin, (name, width, inside, number))
             yield place, between(arb(low), arb(high)).union(number_ball(numbers[place]))
         return
-    is_width = _is_bounded(width) and float(width) >= 0
+    is_width = _is_bounded(width) and float(width) >= 0.0
     refuse_unless(origin, (name, width, is_width, allowed))
     for place in places:
         digits = document.texts.get(place)

@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.variational import Sensitivities
-from sst_ros.errors import check_kinds, read_numbers, refusal, refuse_unless
+from sst_ros.errors import (
+    check_kinds,
+    read_numbers,
+    refusal,
+    refuse_other_rounding,
+    refuse_unless,
+)
 from sst_ros.integration.methods import DORMAND_PRINCE
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism.geometry import Geometry
@@ -153,6 +159,7 @@ def simulate(
         SingularConfiguration: the motion starts from a parallel singularity.
 
     """
+    refuse_other_rounding("simulate")
     given = with_initial(scene_of(scene), initial)
     if torque is None:
         torque = (0.0, 0.0, 0.0) if given.torque is None else given.torque

@@ -49,6 +49,18 @@ def read(text):
     return yaml.load(text, yaml.BaseLoader)
 
 
+def read_values(part):
+    """A part of a document with floats in place of texts that are numbers."""
+    if isinstance(part, dict):
+        return {key: read_values(x) for key, x in part.items()}
+    if isinstance(part, list):
+        return [read_values(x) for x in part]
+    try:
+        return float(part)
+    except ValueError:
+        return part
+
+
 def numbers(part):
     """A part of a document with mpf in place of texts that are numbers."""
     if isinstance(part, dict):
@@ -209,7 +221,7 @@ class TrueState(NamedTuple):
 
 
 def motion(document, near, times, local_error="1e-31"):
-    """States at times of a document with mpf numbers; the number of events.
+    """States at times of a document with mpf numbers, and the events before the last.
 
     30 digits.
     """
@@ -228,7 +240,31 @@ def motion(document, near, times, local_error="1e-31"):
         for line in done.stdout.splitlines():
             row = [mpf(x) for x in line.split()]
             states.append(TrueState(row[:4], row[4:7], row[7:]))
-    return states, len(done.stderr.splitlines())
+        events = []
+        for line in done.stderr.splitlines():
+            index, time = line.split()
+            events.append(TrueEvent(event_name(document, int(index)), mpf(time)))
+    return states, events
+
+
+class TrueEvent(NamedTuple):
+    """When a mode of the motion ends, and the name that `certify` has for it."""
+
+    name: str
+    time: mpf
+
+
+def event_name(document, index):
+    """Return the limit that is met: an end of a stroke, of a pull, or of a torque."""
+    if "stiffness" in document.get("stroke", {}):
+        if index < 9:
+            leg, place = divmod(index, 3)
+            if place == 2:
+                return f"push of stop {leg + 1} ends"
+            end = ("0", "arc")[place]
+            return f"contact of gamma_{leg + 1} at {end}"
+        index -= 9
+    return f"torque_{index // 2 + 1} at its limit"
 
 
 def angle(first, second):

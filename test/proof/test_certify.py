@@ -647,3 +647,9 @@ def test_the_command_prints_what_is_proven(capsys):
         "to 0.05 s" in said
         and "no limit is reached and no singularity is passed" in said
     )
+
+
+def test_a_stiff_motion_is_proven_by_short_steps():
+    # Its set once widened in each step, by V in all of a long one, until nothing held.
+    proven = certify("stiff", duration=0.03, t_eval=[0.03])
+    assert not proven.reason and proven.largest < 1e-12

@@ -286,7 +286,7 @@ def compare(number, folder, corners=CORNERS, inside=INSIDE, family=FAMILY):
         with mp.workdps(truth.DIGITS):
             changed = change(document, ranges, draw)
         states, passed = truth.motion(changed, known, TIMES[:rows])
-        events = max(events, passed)
+        events = max(events, len(passed))
         for row, state in enumerate(states):
             for name, ratio in truth.ratios(proven, row, state).items():
                 worst[name] = max(worst.get(name, 0.0), ratio)

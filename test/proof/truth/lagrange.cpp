@@ -631,7 +631,9 @@ struct Motion {
           y = extrapolate(t, y, at, &unused);
           t += at;
           flip(event);
-          std::fprintf(stderr, "%d %.12Lg\n", event, (long double)t);
+          char when[64];
+          quadmath_snprintf(when, sizeof when, "%.36Qe", t);
+          std::fprintf(stderr, "%d %s\n", event, when);
         } else {
           y = next;
           t = last ? end : t + step;
