@@ -265,7 +265,8 @@ class TimeSteps(FunctionSteps):
 
         Equal ones are asked for once.
         """
-        evaluate = self._torque.of_time(drive)
+        assert drive.function is not None
+        evaluate = self._torque.of_time(drive.function, drive.start)
         known = {time: evaluate(time) for time in dict.fromkeys(times)}
         return [known[time] for time in times]
 
@@ -423,6 +424,7 @@ class FeedbackSteps(FunctionSteps):
         """
         functions, size, moment = self._functions, self._size, drive.numbers[3:]
         evaluate, function, start = self._torque.of_state, drive.function, drive.start
+        assert function is not None
         slopes: list[float] = []
         point = y
         numbers: list[float] = []

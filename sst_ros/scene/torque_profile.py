@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques over time, as a user gives them.
+"""Torques over time, as a user gives them: all are a `TorqueProfile`.
 
-They are numbers, sines, tables, polynomials or functions.
+They are numbers, sines, tables, polynomials or functions. A motion is divided at the
+`kinks` of its profile; on each part a `piece` acts, which is smooth there. The
+integrator holds its numbers, has it as a part of the traced equations, or evaluates it
+by `at`.
 """
 
 from __future__ import annotations
@@ -39,8 +42,11 @@ from sst_ros.state import (
     freeze,
 )
 
-TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
-FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
+TorqueFunction: TypeAlias = (
+    Callable[[float], Sequence[float]] | Callable[[float, State], Sequence[float]]
+)
+"""Torques [N m] at a time [s], or at a time and a state."""
+
 # radians of a sine beyond which its clamping is not computed in advance
 _MOST_CROSSINGS = 1e5
 
@@ -53,12 +59,22 @@ def ascend(times: Array) -> bool:
 
 
 class TorqueProfile(ReadOnly):
-    """Torques that act over a motion; most are known as a function of time alone.
+    """Torques that act over a motion.
 
     A motion keeps the profile that it was given, so nothing in it can change.
+
+    Attributes:
+        kind: name of the kind, in files.
+        feedback: whether the torques depend on the state, too.
+        is_known_ahead: whether they follow from numbers, not from a function.
+        held: the torques where they are the same at all times [N m], else None.
+
     """
 
+    kind = "function"
     feedback = False
+    is_known_ahead = True
+    held: Vector3 | None = None
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute once."""
@@ -67,6 +83,11 @@ class TorqueProfile(ReadOnly):
                 f"{name} is read-only: make another {type(self).__name__}"
             )
         super().__setattr__(name, value)
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """Torques [N m] at a time [s], and a state if `feedback`."""
+        first, second, third = self.values(np.array([time]))[0].tolist()
+        return first, second, third
 
     def values(self, t: Array) -> Array:
         """Torques [N m] at times [s], shape (n,) -> (n, 3); nan if not known from t."""
@@ -80,16 +101,25 @@ class TorqueProfile(ReadOnly):
         """
         return np.empty(0)
 
-    def acting(self, begin: float, end: float) -> Any:
-        """Return what acts on [begin, end], as a `Stepper` takes it.
-
-        No kink lies in the interval.
-        """
+    def piece(self, begin: float, end: float) -> TorqueProfile:
+        """Return the smooth torques of [begin, end], inside of which is no kink."""
         return self
+
+    def record(self) -> dict[str, Any]:
+        """Return kind and numbers, from which `profile_from` builds it again."""
+        numbers = {name: np.asarray(x).tolist() for name, x in vars(self).items()}
+        return {"kind": self.kind, **numbers}
 
 
 class LostTorque(TorqueProfile):
     """Torques of a function that a file does not have: known at the samples alone."""
+
+    is_known_ahead = False
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """Refuse: raises InputError."""
+        allowed = "must be given: the function of the torques is not in the file"
+        raise refusal("simulate", "torque", "a lost function", allowed)
 
 
 class ConstantTorque(TorqueProfile):
@@ -98,20 +128,29 @@ class ConstantTorque(TorqueProfile):
     InputError is raised where they are none.
     """
 
+    kind = "constant"
+
     def __init__(self, torque: Any) -> None:
         self.torque = _three(torque, "torque")
+
+    @property
+    def held(self) -> Vector3:  # type: ignore[override]
+        """The torques [N m]."""
+        return self.torque
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`."""
+        return self.torque
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.tile(self.torque, (len(t), 1))
 
-    def acting(self, begin: float, end: float) -> Vector3:
-        """See `TorqueProfile`."""
-        return self.torque
-
 
 class SineTorque(TorqueProfile, Section):
     """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
+
+    kind = "sine"
 
     amplitude: Vector3 = entry("amplitudes", "N m")
     frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
@@ -121,8 +160,8 @@ class SineTorque(TorqueProfile, Section):
     __getstate__ = Section.__getstate__
     __setstate__ = Section.__setstate__
 
-    def at(self, time: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`; by the sine of `math`."""
         rows = zip(self.amplitude, self.frequency, self.phase, strict=True)
         first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
         return first, second, third
@@ -156,12 +195,6 @@ class SineTorque(TorqueProfile, Section):
         return np.asarray(times[(times > 0.0) & (times < end)])
 
 
-def _at(profile: TorqueProfile, t: float) -> Vector3:
-    """Torques [N m] at a time [s]."""
-    first, second, third = profile.values(np.array([t]))[0].tolist()
-    return first, second, third
-
-
 class PolynomialTorque(TorqueProfile):
     """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`.
 
@@ -171,6 +204,8 @@ class PolynomialTorque(TorqueProfile):
     breakpoints are the beginnings of the pieces and the end of the last [s], shape
     (pieces + 1,). InputError is raised where shapes, order or numbers are not allowed.
     """
+
+    kind = "polynomial"
 
     @check_kinds
     def __init__(self, coefficients: ArrayLike, breakpoints: TimesLike) -> None:
@@ -193,7 +228,7 @@ class PolynomialTorque(TorqueProfile):
             ("coefficients", "not finite", finite, "must be finite"),
         )
 
-    __call__ = _at
+    __call__ = TorqueProfile.at
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -216,20 +251,39 @@ class PolynomialTorque(TorqueProfile):
             [x for x in np.concatenate([self.x, *roots]) if np.isfinite(x)]
         )
 
-    def acting(self, begin: float, end: float) -> Vector3 | TorqueFunction:
+    def piece(self, begin: float, end: float) -> TorqueProfile:
         """See `TorqueProfile`."""
-        piece = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
-        if not 0 <= piece < self.c.shape[1]:
-            return ZERO
-        start, rows = float(self.x[piece]), self.c[:, piece].tolist()
+        number = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
+        if not 0 <= number < self.c.shape[1]:
+            return ConstantTorque(ZERO)
+        return _PolynomialPiece(float(self.x[number]), self.c[:, number].tolist())
 
-        def torque(t: float) -> Vector3:
-            x, total = t - start, ZERO
-            for a, b, c in rows:
-                total = total[0] * x + a, total[1] * x + b, total[2] * x + c
-            return total
 
-        return torque
+class _PolynomialPiece(TorqueProfile):
+    """One piece of a `PolynomialTorque`, also outside of its breakpoints.
+
+    Args:
+        start: its breakpoint [s].
+        rows: three coefficients for each power of the time since then, the highest
+            first.
+
+    """
+
+    def __init__(self, start: float, rows: Sequence[Sequence[float]]) -> None:
+        self._start = start
+        self._rows = rows
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`."""
+        x = time - self._start
+        total = ZERO
+        for a, b, c in self._rows:
+            total = total[0] * x + a, total[1] * x + b, total[2] * x + c
+        return total
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        return np.array([self.at(time) for time in t.tolist()]).reshape(-1, 3)
 
 
 class FunctionTorque(TorqueProfile):
@@ -239,21 +293,29 @@ class FunctionTorque(TorqueProfile):
     argument. InputError: it needs other arguments.
     """
 
+    is_known_ahead = False
+
     def __init__(self, function: Callable[..., Sequence[float]]) -> None:
         self._function = function
         self.feedback = count_arguments(function) == 2
 
-    def __call__(self, t: float, *state: State) -> Vector3:
-        """Torques [N m] at a time [s], and a state where it is an argument."""
-        value = self._function(t, *state)
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`."""
+        value = self._function(time, *state)
         vector = finite_vector(value)
-        return _three(value, f"torque({t:g})") if vector is None else vector
+        return _three(value, f"torque({time:g})") if vector is None else vector
+
+    __call__ = at
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         if self.feedback:
             return super().values(t)
-        return np.array([self(float(time)) for time in t]).reshape(-1, 3)
+        return np.array([self.at(float(time)) for time in t]).reshape(-1, 3)
+
+    def record(self) -> dict[str, Any]:
+        """Return the kind alone: a function is in no file."""
+        return {"kind": self.kind}
 
 
 def _three(value: Any, name: str) -> Vector3:
@@ -317,6 +379,8 @@ class TorqueTable(TorqueProfile):
     InputError is raised where shapes, order or numbers are not allowed.
     """
 
+    kind = "table"
+
     @check_kinds
     def __init__(self, times: TimesLike, torques: ArrayLike) -> None:
         self.times = freeze(read_numbers("torque table", "times", times, seconds=True))
@@ -373,7 +437,7 @@ class TorqueTable(TorqueProfile):
         table = np.array(rows)
         return cls(table[:, 0], table[:, 1:])
 
-    __call__ = _at
+    __call__ = TorqueProfile.at
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -384,23 +448,16 @@ class TorqueTable(TorqueProfile):
         """See `TorqueProfile`."""
         return self.times
 
-    def acting(self, begin: float, end: float) -> Vector3:
+    def piece(self, begin: float, end: float) -> TorqueProfile:
         """See `TorqueProfile`."""
-        return self(0.5 * (begin + end))
+        return ConstantTorque(self.at(0.5 * (begin + end)))
 
 
-Torque = Vector3 | SineTorque | TorqueFunction
-"""A function is called with the time [s], and the `State` if `feedback` is true."""
+Torque: TypeAlias = Vector3 | TorqueProfile
+"""What acts over a period of the integrator: torques that are held, or smooth ones."""
 
-
-def torque_at(torque: Any, *given: Any) -> Any:
-    """Return the torques [N m] of numbers, a sine or a function.
-
-    Given are the time [s] and what it asks for.
-    """
-    if isinstance(torque, SineTorque):
-        return torque.at(*given)
-    return torque(*given) if callable(torque) else torque
+TorqueLike: TypeAlias = Sequence[float] | TorqueProfile | TorqueFunction | None
+"""Torques as a user gives them; by default those of the scene."""
 
 
 def profile_of(torque: Any) -> TorqueProfile:
@@ -416,29 +473,17 @@ def profile_of(torque: Any) -> TorqueProfile:
     return FunctionTorque(torque) if callable(torque) else ConstantTorque(torque)
 
 
-_PROFILE_KINDS = {
-    "constant": ConstantTorque, "sine": SineTorque, "table": TorqueTable,
-    "polynomial": PolynomialTorque, "function": TorqueProfile,
-}  # fmt: skip
-
-
-def record_of(profile: TorqueProfile) -> dict[str, Any]:
-    """Return kind and numbers of a profile.
-
-    `profile_from` builds it again from these.
-    """
-    kind = next(
-        kind
-        for kind, profiles in _PROFILE_KINDS.items()
-        if isinstance(profile, profiles)
-    )
-    given = {} if kind == "function" else vars(profile)
-    return {"kind": kind, **{name: np.asarray(x).tolist() for name, x in given.items()}}
+_KINDS = (ConstantTorque, SineTorque, TorqueTable, PolynomialTorque)
+_PROFILE_KINDS: dict[str, Callable[..., TorqueProfile]] = {
+    profile.kind: profile for profile in _KINDS
+}
 
 
 def profile_from(record: dict[str, Any]) -> TorqueProfile:
-    """Build the profile that `record_of` has described."""
+    """Build the profile that `TorqueProfile.record` has described."""
     kind, *numbers = record.values()
-    if kind == "sine":
+    if kind == TorqueProfile.kind:
+        return LostTorque()
+    if kind == SineTorque.kind:
         return SineTorque(**dict(zip(SineTorque.SPECS, numbers, strict=True)))
-    return LostTorque() if kind == "function" else _PROFILE_KINDS[kind](*numbers)
+    return _PROFILE_KINDS[kind](*numbers)

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.integration.applied_torque import has_feedback
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
-from sst_ros.integration.point import Drive, Step
+from sst_ros.integration.point import Step
 from sst_ros.integration.stepper import Stepper
-from sst_ros.scene.torque_profile import SineTorque, Torque
+from sst_ros.scene.torque_profile import Torque
 from sst_ros.state import Array
 
 _STATE_NUMBERS = 7
@@ -125,22 +124,17 @@ class Samples:
         if states.shape[1] > _STATE_NUMBERS + 1:
             return states[:, _STATE_NUMBERS : _STATE_NUMBERS + 3]
         torques = np.empty((len(t), 3))
+        applied = self._stepper.torque
         ends = [first for first, _ in self._torques[1:]]
-        sines: list[int] = []
         for (first, torque), end in zip(self._torques, [*ends, len(t)], strict=True):
-            if isinstance(torque, SineTorque):
-                sines += range(first, end)
-                sine = torque  # one, traced into the program
-            elif callable(torque) and not has_feedback(torque):
-                evaluate = self._stepper.torque.of_time(Drive((), torque))
-                torques[first:end] = [evaluate(time) for time in t[first:end].tolist()]
-            elif callable(torque):
-                for k in range(first, end):
-                    torques[k] = self._stepper.torque.at(
-                        torque, float(t[k]), states[k].tolist()
-                    )
-            else:
+            if isinstance(torque, tuple):
                 torques[first:end] = torque
-        if sines:
-            torques[sines] = sine.values(t[sines])
+            elif torque.feedback:
+                for k in range(first, end):
+                    torques[k] = applied.at(torque, float(t[k]), states[k].tolist())
+            elif self._stepper.traced_sine(torque) is not None:
+                torques[first:end] = torque.values(t[first:end])
+            else:
+                evaluate = applied.of_time(torque, 0.0)
+                torques[first:end] = [evaluate(time) for time in t[first:end].tolist()]
         return torques

@@ -21,10 +21,8 @@ from sst_ros.removed import REMOVED_METHODS
 from sst_ros.scene.loads import Initial
 from sst_ros.scene.scene import SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import (
-    FeedbackFunction,
     FunctionTorque,
-    SineTorque,
-    TorqueFunction,
+    TorqueLike,
     TorqueProfile,
     TorqueTable,
     ascend,
@@ -72,14 +70,6 @@ answer.
 
 _METHOD_WORDS = "must be one of " + ", ".join(INTEGRATORS)
 
-TorqueInput: TypeAlias = (
-    Sequence[float]
-    | SineTorque
-    | TorqueProfile
-    | TorqueFunction
-    | FeedbackFunction
-    | None
-)
 InitialInput: TypeAlias = (
     Initial | Mapping[str, Any] | tuple[ArrayLike, ArrayLike] | None
 )
@@ -88,7 +78,7 @@ InitialInput: TypeAlias = (
 @check_kinds
 def simulate(
     scene: SceneInput,
-    torque: TorqueInput = None,
+    torque: TorqueLike = None,
     duration: float | None = None,
     *,
     initial: InitialInput = None,

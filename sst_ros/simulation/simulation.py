@@ -34,7 +34,13 @@ from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.scene.scene import SceneInput, scene_of
-from sst_ros.scene.torque_profile import SineTorque, Torque, count_arguments
+from sst_ros.scene.torque_profile import (
+    Torque,
+    TorqueFunction,
+    TorqueProfile,
+    count_arguments,
+    profile_of,
+)
 from sst_ros.state import (
     NANOSECONDS,
     ZERO,
@@ -186,7 +192,10 @@ class Simulation(Explained):
         self.reset()
 
     def step(
-        self, torque: Torque, dt_ns: int, moment: Vector3 = (0.0, 0.0, 0.0)
+        self,
+        torque: Torque | TorqueFunction,
+        dt_ns: int,
+        moment: Vector3 = (0.0, 0.0, 0.0),
     ) -> State:
         """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
 
@@ -210,7 +219,11 @@ class Simulation(Explained):
         return self.state
 
     def steps(
-        self, torque: Torque, dt_ns: int, count: int, moment: Vector3 = (0.0, 0.0, 0.0)
+        self,
+        torque: Torque | TorqueFunction,
+        dt_ns: int,
+        count: int,
+        moment: Vector3 = (0.0, 0.0, 0.0),
     ) -> None:
         """Advance by `count` times dt_ns, bit for bit as by `count` calls of `step`.
 
@@ -221,10 +234,11 @@ class Simulation(Explained):
         numbers, field = finite_vector(torque), finite_vector(moment)
         is_whole = 0 < number <= _MOST_CALL_STEPS and length > 0
         if not (is_whole and numbers and field):
-            acts = callable(torque) or isinstance(torque, SineTorque) or numbers
+            is_torque = numbers is not None or callable(torque)
+            is_torque = is_torque or isinstance(torque, TorqueProfile)
             refuse_unless(
                 "step",
-                ("torque", torque, bool(acts), _TORQUE_WORDS),
+                ("torque", torque, is_torque, _TORQUE_WORDS),
                 ("moment", moment, field is not None, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
                 ("count", count, 0 < number <= _MOST_CALL_STEPS, _COUNT),
@@ -251,20 +265,15 @@ class Simulation(Explained):
             raise refusal("step", "thread", here, allowed)
         self._thread = threading.get_ident()
 
-    def acting(self, torque: Torque) -> Torque:
+    def acting(self, torque: Torque | TorqueFunction) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
-        try:
-            if callable(torque) and not getattr(torque, "feedback", False):
-                refuse_unless(
-                    "step",
-                    ("torque", torque, count_arguments(torque) == 1, _TORQUE_WORDS),
-                )
-            acts = callable(torque) or isinstance(torque, SineTorque)
-            if not acts and finite_vector(torque) is None:
-                raise ValueError
-            return self._stepper.torque.acting(torque)
-        except (TypeError, ValueError, OverflowError):
-            raise refusal("step", "torque", torque, _TORQUE_WORDS) from None
+        held = finite_vector(torque)
+        if held is not None:
+            return self._stepper.torque.acting(held)
+        if not isinstance(torque, TorqueProfile):
+            is_function = callable(torque) and count_arguments(torque) == 1
+            refuse_unless("step", ("torque", torque, is_function, _TORQUE_WORDS))
+        return self._stepper.torque.acting(profile_of(torque))
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked.
