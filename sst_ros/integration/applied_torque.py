@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -91,15 +91,15 @@ class AppliedTorque:
         state = State.of(round(time * NANOSECONDS), y, joints, lagged)
         return clamp(torque.at(time, state), self.limit)
 
-    def of_time(
-        self, torque: TorqueProfile, start: float
-    ) -> Callable[[float], Vector3]:
-        """Return torques within the limit, by the time since `start` [s]."""
-        evaluate = torque.at
+    def at_times(
+        self, torque: TorqueProfile, times: Sequence[float]
+    ) -> Sequence[Vector3]:
+        """Torques without feedback that act at times [s], within the limit [N m]."""
+        torques = torque.at_times(times)
         limit = self.limit
         if limit is None:
-            return lambda t: evaluate(start + t)
-        return lambda t: clamp(evaluate(start + t), limit)
+            return torques
+        return [clamp(each, limit) for each in torques]
 
     def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
         """Return the torques of a drive with a function [N m].

@@ -14,6 +14,7 @@ import csv
 import inspect
 import math
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO, TypeAlias
 
@@ -88,6 +89,10 @@ class TorqueProfile(ReadOnly):
         """Torques [N m] at a time [s], and a state if `feedback`."""
         first, second, third = self.values(np.array([time]))[0].tolist()
         return first, second, third
+
+    def at_times(self, times: Sequence[float]) -> list[Vector3]:
+        """Torques [N m] at times [s], each as by `at`."""
+        return [self.at(time) for time in times]
 
     def values(self, t: Array) -> Array:
         """Torques [N m] at times [s], shape (n,) -> (n, 3); nan if not known from t."""
@@ -307,15 +312,30 @@ class FunctionTorque(TorqueProfile):
 
     __call__ = at
 
+    def at_times(self, times: Sequence[float]) -> list[Vector3]:
+        """See `TorqueProfile`; the values are checked together."""
+        values: list[Any] = [self._function(time) for time in times]
+        if _are_plain_vectors(values):
+            return values
+        return super().at_times(times)
+
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         if self.feedback:
             return super().values(t)
-        return np.array([self.at(float(time)) for time in t]).reshape(-1, 3)
+        return np.array(self.at_times(t.tolist())).reshape(-1, 3)
 
     def record(self) -> dict[str, Any]:
         """Return the kind alone: a function is in no file."""
         return {"kind": self.kind}
+
+
+def _are_plain_vectors(values: Sequence[Any]) -> bool:
+    """Return whether all values are tuples of three finite floats."""
+    if set(map(type, values)) != {tuple} or set(map(len, values)) != {3}:
+        return False
+    numbers = list(chain.from_iterable(values))
+    return set(map(type, numbers)) == {float} and math.isfinite(sum(numbers))
 
 
 def _three(value: Any, name: str) -> Vector3:

@@ -99,7 +99,7 @@ class Samples:
             states[list(rows)] = known
         self._step_to(t, states)
         joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE_NUMBERS])
-        torque = self._torque_at(t, states)
+        torque = self._torque_at(t, states, joints)
         return SampleTable(
             t, states[:, :4], states[:, 4:_STATE_NUMBERS], torque, joints
         )
@@ -118,7 +118,7 @@ class Samples:
             x = t[numbers] - np.array([run.begin for run in runs]).repeat(counts)
             states[numbers] = taken[0].steps.states_inside(taken, counts, x)
 
-    def _torque_at(self, t: Array, states: Array) -> Array:
+    def _torque_at(self, t: Array, states: Array, joints: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
         # the actuators lag: they are part of the state
         if states.shape[1] > _STATE_NUMBERS + 1:
@@ -130,11 +130,14 @@ class Samples:
             if isinstance(torque, tuple):
                 torques[first:end] = torque
             elif torque.feedback:
-                for k in range(first, end):
-                    torques[k] = applied.at(torque, float(t[k]), states[k].tolist())
+                part = slice(first, end)
+                rows = (array[part].tolist() for array in (t, states, joints))
+                torques[part] = [
+                    applied.of_state(torque, time, state, angles)
+                    for time, state, angles in zip(*rows, strict=True)
+                ]
             elif self._stepper.traced_sine(torque) is not None:
                 torques[first:end] = torque.values(t[first:end])
             else:
-                evaluate = applied.of_time(torque, 0.0)
-                torques[first:end] = [evaluate(time) for time in t[first:end].tolist()]
+                torques[first:end] = applied.at_times(torque, t[first:end].tolist())
         return torques
