@@ -7,7 +7,7 @@ import functools
 import html
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
@@ -21,10 +21,6 @@ Array: TypeAlias = NDArray[np.float64]
 Vector3: TypeAlias = tuple[float, float, float]
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 Quaternion: TypeAlias = tuple[float, float, float, float]  # (x, y, z, w)
-TorqueFunction: TypeAlias = Callable[[float], Vector3]
-"""Actuator torques [N m] at a simulated time [s]."""
-
-
 TimesLike: TypeAlias = Union[ArrayLike, timedelta]  # noqa: UP007 (at run time)
 """Times [s], as numbers or as durations of NumPy, pandas or `datetime`."""
 

@@ -56,7 +56,6 @@ from sst_ros.scene.torque_profile import (
     SineTorque,
     TorqueProfile,
     TorqueTable,
-    torque_at,
 )
 from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace_values
 from sst_ros.state import Array, clamp, freeze
@@ -176,11 +175,14 @@ class VariationalEquations:
         blocks = np.cumsum([1, size, 3 * self._by_torque])
 
         def rates(
-            time: float, y: Array, acting: Any, forcing: Callable[[float], Array]
+            time: float,
+            y: Array,
+            acting: TorqueProfile,
+            forcing: Callable[[float], Array],
         ) -> Array:
             if next(evaluations, None) is None:
                 raise ArithmeticError
-            torque = clamp(torque_at(acting, time), limit)
+            torque = clamp(acting.at(time), limit)
             flat = derivatives(*y[:size].tolist(), *torque, *parameters)
             rows = np.array(flat).reshape(-1, size)
             rate, by_state, by_torque, by_parameter = np.split(rows, blocks)
@@ -203,7 +205,7 @@ class VariationalEquations:
         begin = 0.0
         for stop in np.append(np.unique(inside), end).tolist():
             reached = (t > begin) & (t <= stop)
-            law = self._torque.acting(begin, stop), self._forcing(begin, stop, limit)
+            law = self._torque.piece(begin, stop), self._forcing(begin, stop, limit)
             try:
                 run = solve_ivp(
                     rates, (begin, stop), y, "DOP853", np.union1d(t[reached], stop),
@@ -309,7 +311,7 @@ class VariationalEquations:
             return lambda time: np.empty((0, 0))
         slopes = _differentiate_torque(self._torque, begin, end)
         middle = 0.5 * (begin + end)
-        acting = np.abs(torque_at(self._torque.acting(begin, end), middle))
+        acting = np.abs(self._torque.piece(begin, end).at(middle))
         free = (acting <= (np.inf if limit is None else limit))[:, None]
         return lambda time: slopes(time) * free
 

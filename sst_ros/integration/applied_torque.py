@@ -4,22 +4,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
-from sst_ros.errors import InputError, Problem
 from sst_ros.integration.point import Drive
 from sst_ros.mechanism.geometry import Array
-from sst_ros.scene.torque_profile import (
-    FunctionTorque,
-    SineTorque,
-    Torque,
-    torque_at,
-)
+from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile
 from sst_ros.state import NANOSECONDS, State, Vector3, clamp
 
 _SEARCHED = 8
@@ -38,94 +31,82 @@ _NOT_FINITE = (math.nan, math.nan, math.nan)
 
 
 class AppliedTorque:
-    """What the actuators give of a torque.
+    """What the actuators give of a torque: it, within their limit.
 
     Args:
         dynamics: of the scene.
         limit: largest torque of an actuator [N m], or None.
-        traced: whether sines may be part of the traced equations.
 
     """
 
-    def __init__(
-        self, dynamics: Dynamics, limit: float | None, *, traced: bool = True
-    ) -> None:
-        self._dynamics, self.limit, self._traced = dynamics, limit, traced
+    def __init__(self, dynamics: Dynamics, limit: float | None) -> None:
+        self._dynamics, self.limit = dynamics, limit
         self._lags = len(dynamics.state) > 7
 
     def acting(self, torque: Torque) -> Torque:
-        """Return what acts: numbers within the limit of the actuators.
-
-        Functions as they are.
-
-        A sine becomes a function where it is no part of the program: the actuators
-        clamp it, or the equations are not traced.
-        """
-        if isinstance(torque, SineTorque):
-            return (
-                torque if self._traced and self.limit_of(torque) is None else torque.at
-            )
-        if callable(torque):
+        """Return what acts: torques that are held within the limit, others as given."""
+        held = torque.held if isinstance(torque, TorqueProfile) else torque
+        if held is None:
             return torque
-        first, second, third = map(float, torque)
+        first, second, third = map(float, held)
         return clamp((first, second, third), self.limit)
 
     def limit_of(self, torque: SineTorque) -> float | None:
         """Return the limit of the actuators where it clamps a sine [N m]."""
         limit = self.limit
-        return (
-            None if limit is None or max(map(abs, torque.amplitude)) <= limit else limit
-        )
+        if limit is None or max(map(abs, torque.amplitude)) <= limit:
+            return None
+        return limit
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
         """Torques that act at a time [s] and a state y, within the limit [N m].
 
         Raises:
-            InputError: what a function returns is not three numbers.
+            InputError: what a function returns is not three finite numbers.
 
         """
-        if has_feedback(torque):
+        if not isinstance(torque, TorqueProfile):
+            return clamp(torque, self.limit)
+        if torque.feedback:
             return self.of_state(torque, time, y, self._dynamics.joints(*y[:7]))
-        return clamp(_three_numbers(torque_at(torque, time), time), self.limit)
+        return clamp(torque.at(time), self.limit)
 
     def of_state(
-        self, function: Any, time: float, y: Sequence[float], joints: Sequence[float]
+        self,
+        torque: TorqueProfile,
+        time: float,
+        y: Sequence[float],
+        joints: Sequence[float],
     ) -> Vector3:
-        """Torques of a function at a time [s] and a state y with its joints [N m].
+        """Torques with feedback at a time [s] and a state y with its joints [N m].
 
-        In the state that it is given are the lagged torques of the actuators; without
-        lag zero, for torques of this instant are what it returns. Where the state is
-        not finite, as in a trial step that is too long, it is not called, and the
-        torques are nan.
+        In the state that a function is given are the lagged torques of the actuators;
+        without lag zero, for torques of this instant are what it returns. Where the
+        state is not finite, as in a trial step that is too long, it is not called, and
+        the torques are nan.
         """
         if not math.isfinite(sum(y)):
             return _NOT_FINITE
         lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
         state = State.of(round(time * NANOSECONDS), y, joints, lagged)
-        torque = function(time, state)
-        if not isinstance(function, FunctionTorque):  # it checks what it returns
-            torque = _three_numbers(torque, time)
-        return clamp(torque, self.limit)
+        return clamp(torque.at(time, state), self.limit)
 
-    def of_time(self, drive: Drive) -> Callable[[float], Vector3]:
-        """Return the torques of a drive as a function of the time of the steps [s]."""
-        function, start, limit = drive.function, drive.start, self.limit
-        if isinstance(function, FunctionTorque):  # it checks what it returns
-            if limit is None:
-                return lambda t: function(start + t)
-            return lambda t: clamp(function(start + t), limit)
-
-        def evaluate(t: float) -> Vector3:
-            time = start + t
-            return clamp(_three_numbers(function(time), time), limit)
-
-        return evaluate
+    def at_times(
+        self, torque: TorqueProfile, times: Sequence[float]
+    ) -> Sequence[Vector3]:
+        """Torques without feedback that act at times [s], within the limit [N m]."""
+        torques = torque.at_times(times)
+        limit = self.limit
+        if limit is None:
+            return torques
+        return [clamp(each, limit) for each in torques]
 
     def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
         """Return the torques of a drive with a function [N m].
 
         They are those at a time of the steps [s] and a state.
         """
+        assert drive.function is not None
         return self.at(drive.function, drive.start + t, y)
 
     def locate_jump(
@@ -176,7 +157,7 @@ class AppliedTorque:
     ) -> Array:
         """Differentiate a function's torques by the state, shape (3, size)."""
         slopes = np.zeros((3, len(y)))
-        if has_feedback(drive.function):
+        if drive.function is not None and drive.function.feedback:
             # the last number is the work, which no torque sees
             for i in range(len(y) - 1):
                 step = _STATE_STEP * max(1.0, abs(y[i]))
@@ -184,23 +165,3 @@ class AppliedTorque:
                 change = np.array(self.of_drive(drive, t, moved)) - torque
                 slopes[:, i] = change / step
         return slopes
-
-
-def has_feedback(torque: Torque) -> bool:
-    """Return whether a torque is a function of the state, too."""
-    return bool(getattr(torque, "feedback", False))
-
-
-def _three_numbers(value: Any, time: float) -> Vector3:
-    """Return a torque function's value as three floats, or refuse it.
-
-    The floats need not be finite.
-    """
-    try:
-        first, second, third = value
-        if isinstance(first + second + third, np.complexfloating):
-            raise TypeError
-        return float(first), float(second), float(third)
-    except (TypeError, ValueError):
-        allowed = "a torque function must return three torques [N m]"
-        raise InputError("torque", [Problem(f"f({time:g})", value, allowed)]) from None

@@ -29,7 +29,7 @@ from sst_ros.integration.method_steps import (
     read_outcome,
     trace_steps,
 )
-from sst_ros.integration.methods import Method, Rosenbrock, Tableau
+from sst_ros.integration.methods import DenseOutput, Method, Rosenbrock, Tableau
 from sst_ros.integration.point import Drive, Outcome, Point, Step
 from sst_ros.integration.steps import (
     Linearisation,
@@ -265,8 +265,11 @@ class TimeSteps(FunctionSteps):
 
         Equal ones are asked for once.
         """
-        evaluate = self._torque.of_time(drive)
-        known = {time: evaluate(time) for time in dict.fromkeys(times)}
+        assert drive.function is not None
+        different = list(dict.fromkeys(times))
+        absolute = [drive.start + time for time in different]
+        torques = self._torque.at_times(drive.function, absolute)
+        known = dict(zip(different, torques, strict=True))
         return [known[time] for time in times]
 
     @staticmethod
@@ -423,6 +426,7 @@ class FeedbackSteps(FunctionSteps):
         """
         functions, size, moment = self._functions, self._size, drive.numbers[3:]
         evaluate, function, start = self._torque.of_state, drive.function, drive.start
+        assert function is not None
         slopes: list[float] = []
         point = y
         numbers: list[float] = []
@@ -442,18 +446,19 @@ class FeedbackSteps(FunctionSteps):
         dense = self.method.dense
         if dense is None:
             return super().interpolate(step)
+        a, weights_of_terms = _arrays_of_dense(dense)
         size, h, begin = self._size, step.h, np.array(step.begin.y)
         slopes = np.array(step.stages).reshape(-1, size)
         end = np.array(step.end.y)
         slopes = np.vstack([slopes, self.slope(step.t + h, step.end.y, step.drive)])
-        for node, weights in zip(dense.c, dense.a, strict=True):
-            point = begin + h * (np.array(weights) @ slopes)
+        for node, weights in zip(dense.c, a, strict=True):
+            point = begin + h * (weights @ slopes)
             slope = self.slope(step.t + node * h, point.tolist(), step.drive)
             slopes = np.vstack([slopes, slope])
         chord = end - begin
         bend = h * slopes[0] - chord
         twist = chord - bend - h * slopes[len(self.method.c)]
-        terms = [chord, bend, twist, *(h * (np.array(dense.weights) @ slopes))]
+        terms = [chord, bend, twist, *(h * (weights_of_terms @ slopes))]
         if not np.isfinite(terms).all():
             return None
 
@@ -466,6 +471,12 @@ class FeedbackSteps(FunctionSteps):
             return np.asarray(begin + total)
 
         return states
+
+
+@lru_cache(maxsize=8)
+def _arrays_of_dense(dense: DenseOutput) -> tuple[list[Array], Array]:
+    """Return the weights of a dense output as arrays."""
+    return [np.array(weights) for weights in dense.a], np.array(dense.weights)
 
 
 _WORST_OF_DENSE = 0.83

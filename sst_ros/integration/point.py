@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Method
+from sst_ros.scene.torque_profile import SineTorque, TorqueProfile
 
 _ERROR_MARGIN = 2.0
 """Factor on the distance of both solutions.
@@ -91,8 +92,9 @@ class Drive(NamedTuple):
     """Torques [N m], or phases of a sine [rad], or zero where a function gives the
     torques; then the moment on the star in {B} [N m] where the scene takes one.
     """
-    function: Any = None  # torques as a function of the time, or of it and the state
+    function: TorqueProfile | None = None  # torques that the steps evaluate
     start: float = 0.0  # time of the run at which that of the steps is zero [s]
+    sine: SineTorque | None = None  # torques that are part of the traced equations
 
 
 class Outcome(NamedTuple):

@@ -35,7 +35,7 @@ from sst_ros.dynamics.model import (
     transitions_of,
 )
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
-from sst_ros.integration.applied_torque import AppliedTorque, has_feedback
+from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.events import (
     all_far,
     first_event,
@@ -60,7 +60,7 @@ from sst_ros.integration.methods import (
 from sst_ros.integration.point import Drive, MethodChange, Point, Step
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import SineTorque, Torque
+from sst_ros.scene.torque_profile import ConstantTorque, SineTorque, Torque
 from sst_ros.state import Vector3
 
 Moment = tuple[float, ...]
@@ -188,6 +188,8 @@ class Stepper:
 
     """
 
+    _traces_clamped_sines = False
+
     def __init__(
         self,
         scene: Scene,
@@ -209,13 +211,13 @@ class Stepper:
         self._ranges = ranges_of([*ends, *free_range(contacts)])
         self._transitions = transitions_of(scene, tolerance)
         traced = derivative is None
-        self.torque = AppliedTorque(self.dynamics, scene.torque_limit, traced=traced)
+        self.torque = AppliedTorque(self.dynamics, scene.torque_limit)
         self._derivative = derivative
         self._tolerance, self._max_step = tolerance, max_step
         self._methods = methods_of(method)
         # A derivative of its own has no Jacobian to choose a method by.
         self._chooses = len(self._methods) > 1 and traced
-        self._steps: dict[tuple[object, str], Steps] = {}
+        self._steps: dict[tuple[SineTorque | None, bool | None, str], Steps] = {}
 
     def begin(self, y: Sequence[float], method: Method | None = None) -> Point:
         """Complete quaternion, body rate and lagged torques to a point.
@@ -306,38 +308,50 @@ class Stepper:
 
     def _hold(self, torque: Torque, start: float, moment: Moment) -> Drive:
         """Return what acts in a period that begins at `start` [s]."""
-        if isinstance(torque, SineTorque):
-            rows = zip(torque.frequency, torque.phase, strict=True)
-            phases = (math.fmod(f * start + phase, math.tau) for f, phase in rows)
-            return Drive((*phases, *moment), torque, start)
-        if callable(torque) or self._derivative is not None:
+        if isinstance(torque, tuple):
+            if self._derivative is None:
+                return Drive((*torque, *moment), None, start)
+            torque = ConstantTorque(torque)
+        sine = self.traced_sine(torque)
+        if sine is None:
             return Drive((0.0, 0.0, 0.0, *moment), torque, start)
-        first, second, third = torque
-        return Drive((first, second, third, *moment), None, start)
+        rows = zip(sine.frequency, sine.phase, strict=True)
+        phases = (math.fmod(f * start + phase, math.tau) for f, phase in rows)
+        return Drive((*phases, *moment), None, start, sine)
+
+    def traced_sine(self, torque: Torque) -> SineTorque | None:
+        """Return a sine that is part of the traced equations, None for other torques.
+
+        The steps evaluate one that the actuators clamp, as its kinks divide the motion.
+        """
+        if not isinstance(torque, SineTorque) or self._derivative is not None:
+            return None
+        is_clamped = self.torque.limit_of(torque) is not None
+        return None if is_clamped and not self._traces_clamped_sines else torque
 
     def _steps_of(self, drive: Drive, method: Method) -> Steps:
         """Return the steps of a method under a drive."""
         function = drive.function
-        is_sine = function is None or isinstance(function, SineTorque)
-        key = function if is_sine else has_feedback(function), method.name
+        feedback = None if function is None else function.feedback
+        key = drive.sine, feedback, method.name
         if key not in self._steps:
-            self._steps[key] = self._make_steps(function, method)
+            self._steps[key] = self._make_steps(drive, method)
         return self._steps[key]
 
-    def _make_steps(self, function: Any, method: Method) -> Steps:
-        """Make the steps of a method under a function, or numbers where it is None."""
+    def _make_steps(self, drive: Drive, method: Method) -> Steps:
+        """Make the steps of a method under a drive."""
+        sine, function = drive.sine, drive.function
+        if sine is not None:
+            limit = self.torque.limit_of(sine)
+            ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
+            return steps_of(ode, method)
         if function is None:
             return steps_of(self.ode, method)
-        if isinstance(function, SineTorque):
-            limit = self.torque.limit_of(function)
-            ode = recent_ode(
-                self.dynamics, function, limit=limit, work=True, phases=True
-            )
-            return steps_of(ode, method)
         if self._derivative is not None or isinstance(method, Rosenbrock):
             return FunctionSteps(self.ode, method, self.torque, self._derivative)
-        kind = FeedbackSteps if has_feedback(function) else TimeSteps
-        return kind(self.ode, method, self.torque)
+        if function.feedback:
+            return FeedbackSteps(self.ode, method, self.torque)
+        return TimeSteps(self.ode, method, self.torque)
 
     def _take_step(
         self,
@@ -450,7 +464,7 @@ class Stepper:
         self, t: float, h: float, y: Sequence[float], drive: Drive
     ) -> list[float]:
         """Return times just before and after a torque's jump in a step, if any."""
-        if not callable(drive.function) or isinstance(drive.function, SineTorque):
+        if drive.function is None:
             return []
         time = drive.start + t
         if h < _SHORTEST_SEARCH * max(abs(time), h):

@@ -421,10 +421,10 @@ def run(command_line: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker
-    close. Words are a key of `settings.NODE_COMMANDS` and the arguments behind it. The
+    close. The command line is a key of `settings.NODE_COMMANDS` and the arguments behind it. The
     exit status is 0, 1 for a failure, 2 for arguments that are refused.
     """
-    status = _run(words)
+    status = _run(command_line)
     atexit.register(_leave_compilation, status)
     return status
 
@@ -443,7 +443,7 @@ def _leave_compilation(status: int) -> None:
         os._exit(status)
 
 
-def _run(words: Sequence[str]) -> int:
+def _run(command_line: Sequence[str]) -> int:
     signals.handle()
     command, *node_arguments = command_line
     if {"-h", "--help"} & set(node_arguments):

@@ -15,8 +15,8 @@ from sst_ros.nodes import topics
 from sst_ros.nodes.process import AnsweringWorker
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
-from sst_ros.scene.torque_profile import TorqueTable
-from sst_ros.state import NANOSECONDS, ZERO, TorqueFunction, Vector3
+from sst_ros.scene.torque_profile import TorqueProfile, TorqueTable
+from sst_ros.state import NANOSECONDS, ZERO, Vector3
 
 
 class TorquePlayer(AnsweringWorker[PlayerParameters]):
@@ -57,7 +57,7 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
         end_ns = round(self._duration * NANOSECONDS)
         hold_ns = min(parameters.period_ns, max(0, end_ns - elapsed_ns))
         at_ns = elapsed_ns + (hold_ns / 2 if parameters.hold == "middle" else 0)
-        return self._profile(at_ns / NANOSECONDS)
+        return self._profile.at(at_ns / NANOSECONDS)
 
     def _check_period(self, stamp_ns: int) -> None:
         """Warn once where the samples come at another period than that of `rate`."""
@@ -73,7 +73,7 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
         )
 
 
-def _load(parameters: PlayerParameters) -> tuple[TorqueFunction, float]:
+def _load(parameters: PlayerParameters) -> tuple[TorqueProfile, float]:
     if parameters.csv != "-":
         table = TorqueTable.read(parameters.csv)
         return table, float(table.times[-1])
@@ -83,4 +83,4 @@ def _load(parameters: PlayerParameters) -> tuple[TorqueFunction, float]:
             "must have torque and duration to be played, or csv must name a file"
         )
         raise refusal("torque_player", "scene", played.name, requirement)
-    return played.torque.at, played.duration
+    return played.torque, played.duration

@@ -70,12 +70,12 @@ from sst_ros.proof.scene_balls import (
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Place, key_of
 from sst_ros.scene.torque_profile import (
-    FunctionTorque,
-    LostTorque,
+    ConstantTorque,
     SineTorque,
+    TorqueLike,
     TorqueProfile,
 )
-from sst_ros.simulation.simulate import TorqueInput, simulate
+from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import NANOSECONDS, Explained, cached_property
 
@@ -267,12 +267,12 @@ class BallEquations:
         if self.loop is not None:
             return function
         size = len(self.state)
-        acting: Any = (0.0, 0.0, 0.0)
+        piece: TorqueProfile = ConstantTorque((0.0, 0.0, 0.0))
         if self._profile is not None and not isinstance(self._profile, SineTorque):
-            acting = self._profile.acting(begin, end)
+            piece = self._profile.piece(begin, end)
 
         def commanded(time: Any, *y: Any) -> Sequence[Any]:
-            command = acting(time) if callable(acting) else map(arb, acting)
+            command = map(arb, piece.at(time))
             return function(time, *y[:size], *command, *y[size:])
 
         return commanded
@@ -913,7 +913,7 @@ def _narrowed(ranges: Mapping[Place, Any], share: float) -> dict[Place, Any]:
 @check_kinds
 def certify(
     scene: Scene | Mapping[str, Any] | str | Path,
-    torque: TorqueInput = None,
+    torque: TorqueLike = None,
     duration: float | None = None,
     *,
     bound: float = 1e-9,
@@ -971,9 +971,7 @@ def certify(
     given = trajectory.scene
     profile = trajectory.law
     end = given.duration if duration is None else duration
-    is_known = profile is not None and not isinstance(
-        profile, (FunctionTorque, LostTorque)
-    )
+    is_known = profile is not None and profile.is_known_ahead
     refuse_unless(
         "certify",
         ("torque", torque, is_known, KNOWN_TORQUES),

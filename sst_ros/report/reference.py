@@ -61,6 +61,9 @@ class TickStepper(Stepper):
     the actuators; without them they are those of each tick.
     """
 
+    # the limit of the actuators is part of the program
+    _traces_clamped_sines = True
+
     def __init__(self, scene: Scene, torque: SineTorque | None) -> None:
         self._sine = torque
         budget = EvaluationBudget(TICK_BUDGET)
@@ -91,8 +94,6 @@ class TickStepper(Stepper):
         """Advance through one tick; a long one is divided."""
         torque: Torque = self._sine or (drive[0], drive[1], drive[2])
         acting = self.torque.acting(torque)
-        if self._sine is not None:  # the limit of the actuators is part of the program
-            acting = self._sine
         moment = tuple(drive[3:])
         count = max(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
         begin = start_ns / NANOSECONDS

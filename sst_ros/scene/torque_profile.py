@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques over time, as a user gives them.
+"""Torques over time, as a user gives them: all are a `TorqueProfile`.
 
-They are numbers, sines, tables, polynomials or functions.
+They are numbers, sines, tables, polynomials or functions. A motion is divided at the
+`kinks` of its profile; on each part a `piece` acts, which is smooth there. The
+integrator holds its numbers, has it as a part of the traced equations, or evaluates it
+by `at`.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import csv
 import inspect
 import math
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO, TypeAlias
 
@@ -39,8 +43,11 @@ from sst_ros.state import (
     freeze,
 )
 
-TorqueFunction: TypeAlias = Callable[[float], Sequence[float]]
-FeedbackFunction: TypeAlias = Callable[[float, State], Sequence[float]]
+TorqueFunction: TypeAlias = (
+    Callable[[float], Sequence[float]] | Callable[[float, State], Sequence[float]]
+)
+"""Torques [N m] at a time [s], or at a time and a state."""
+
 # radians of a sine beyond which its clamping is not computed in advance
 _MOST_CROSSINGS = 1e5
 
@@ -53,12 +60,22 @@ def ascend(times: Array) -> bool:
 
 
 class TorqueProfile(ReadOnly):
-    """Torques that act over a motion; most are known as a function of time alone.
+    """Torques that act over a motion.
 
     A motion keeps the profile that it was given, so nothing in it can change.
+
+    Attributes:
+        kind: name of the kind, in files.
+        feedback: whether the torques depend on the state, too.
+        is_known_ahead: whether they follow from numbers, not from a function.
+        held: the torques where they are the same at all times [N m], else None.
+
     """
 
+    kind = "function"
     feedback = False
+    is_known_ahead = True
+    held: Vector3 | None = None
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute once."""
@@ -67,6 +84,15 @@ class TorqueProfile(ReadOnly):
                 f"{name} is read-only: make another {type(self).__name__}"
             )
         super().__setattr__(name, value)
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """Torques [N m] at a time [s], and a state if `feedback`."""
+        first, second, third = self.values(np.array([time]))[0].tolist()
+        return first, second, third
+
+    def at_times(self, times: Sequence[float]) -> list[Vector3]:
+        """Torques [N m] at times [s], each as by `at`."""
+        return [self.at(time) for time in times]
 
     def values(self, t: Array) -> Array:
         """Torques [N m] at times [s], shape (n,) -> (n, 3); nan if not known from t."""
@@ -80,16 +106,25 @@ class TorqueProfile(ReadOnly):
         """
         return np.empty(0)
 
-    def acting(self, begin: float, end: float) -> Any:
-        """Return what acts on [begin, end], as a `Stepper` takes it.
-
-        No kink lies in the interval.
-        """
+    def piece(self, begin: float, end: float) -> TorqueProfile:
+        """Return the smooth torques of [begin, end], inside of which is no kink."""
         return self
+
+    def record(self) -> dict[str, Any]:
+        """Return kind and numbers, from which `profile_from` builds it again."""
+        numbers = {name: np.asarray(x).tolist() for name, x in vars(self).items()}
+        return {"kind": self.kind, **numbers}
 
 
 class LostTorque(TorqueProfile):
     """Torques of a function that a file does not have: known at the samples alone."""
+
+    is_known_ahead = False
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """Refuse: raises InputError."""
+        allowed = "must be given: the function of the torques is not in the file"
+        raise refusal("simulate", "torque", "a lost function", allowed)
 
 
 class ConstantTorque(TorqueProfile):
@@ -98,20 +133,29 @@ class ConstantTorque(TorqueProfile):
     InputError is raised where they are none.
     """
 
+    kind = "constant"
+
     def __init__(self, torque: Any) -> None:
         self.torque = _three(torque, "torque")
+
+    @property
+    def held(self) -> Vector3:  # type: ignore[override]
+        """The torques [N m]."""
+        return self.torque
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`."""
+        return self.torque
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         return np.tile(self.torque, (len(t), 1))
 
-    def acting(self, begin: float, end: float) -> Vector3:
-        """See `TorqueProfile`."""
-        return self.torque
-
 
 class SineTorque(TorqueProfile, Section):
     """Torques tau_k(t) = amplitude_k sin(frequency_k t + phase_k)."""
+
+    kind = "sine"
 
     amplitude: Vector3 = entry("amplitudes", "N m")
     frequency: Vector3 = entry("angular frequencies", "rad/s", least=0.0)
@@ -121,8 +165,8 @@ class SineTorque(TorqueProfile, Section):
     __getstate__ = Section.__getstate__
     __setstate__ = Section.__setstate__
 
-    def at(self, time: float) -> Vector3:
-        """Torques [N m] at a time [s]."""
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`; by the sine of `math`."""
         rows = zip(self.amplitude, self.frequency, self.phase, strict=True)
         first, second, third = (a * math.sin(f * time + p) for a, f, p in rows)
         return first, second, third
@@ -154,12 +198,6 @@ class SineTorque(TorqueProfile, Section):
         return np.asarray(times[(times > 0.0) & (times < end)])
 
 
-def _at(profile: TorqueProfile, t: float) -> Vector3:
-    """Torques [N m] at a time [s]."""
-    first, second, third = profile.values(np.array([t]))[0].tolist()
-    return first, second, third
-
-
 class PolynomialTorque(TorqueProfile):
     """Polynomial pieces, in the layout of `scipy.interpolate.PPoly`.
 
@@ -169,6 +207,8 @@ class PolynomialTorque(TorqueProfile):
     breakpoints are the beginnings of the pieces and the end of the last [s], shape
     (pieces + 1,). InputError is raised where shapes, order or numbers are not allowed.
     """
+
+    kind = "polynomial"
 
     @check_kinds
     def __init__(self, coefficients: ArrayLike, breakpoints: TimesLike) -> None:
@@ -189,7 +229,7 @@ class PolynomialTorque(TorqueProfile):
             ("coefficients", "not finite", finite, "must be finite"),
         )
 
-    __call__ = _at
+    __call__ = TorqueProfile.at
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -212,23 +252,39 @@ class PolynomialTorque(TorqueProfile):
         candidates = np.concatenate(times)
         return np.unique(candidates[np.isfinite(candidates)])
 
-    def acting(self, begin: float, end: float) -> Vector3 | TorqueFunction:
+    def piece(self, begin: float, end: float) -> TorqueProfile:
         """See `TorqueProfile`."""
-        index = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
-        if not 0 <= index < self.c.shape[1]:
-            return ZERO
-        start = float(self.x[index])
-        rows = self.c[:, index].tolist()
+        number = int(np.searchsorted(self.x, 0.5 * (begin + end))) - 1
+        if not 0 <= number < self.c.shape[1]:
+            return ConstantTorque(ZERO)
+        return _PolynomialPiece(float(self.x[number]), self.c[:, number].tolist())
 
-        def torque(t: float) -> Vector3:
-            """Evaluate the polynomials of the three actuators by Horner's rule."""
-            x = t - start
-            total = ZERO
-            for a, b, c in rows:
-                total = total[0] * x + a, total[1] * x + b, total[2] * x + c
-            return total
 
-        return torque
+class _PolynomialPiece(TorqueProfile):
+    """One piece of a `PolynomialTorque`, also outside of its breakpoints.
+
+    Args:
+        start: its breakpoint [s].
+        rows: three coefficients for each power of the time since then, the highest
+            first.
+
+    """
+
+    def __init__(self, start: float, rows: Sequence[Sequence[float]]) -> None:
+        self._start = start
+        self._rows = rows
+
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`."""
+        x = time - self._start
+        total = ZERO
+        for a, b, c in self._rows:
+            total = total[0] * x + a, total[1] * x + b, total[2] * x + c
+        return total
+
+    def values(self, t: Array) -> Array:
+        """See `TorqueProfile`."""
+        return np.array([self.at(time) for time in t.tolist()]).reshape(-1, 3)
 
 
 class FunctionTorque(TorqueProfile):
@@ -238,21 +294,44 @@ class FunctionTorque(TorqueProfile):
     argument. InputError: it needs other arguments.
     """
 
+    is_known_ahead = False
+
     def __init__(self, function: Callable[..., Sequence[float]]) -> None:
         self._function = function
         self.feedback = count_arguments(function) == 2
 
-    def __call__(self, t: float, *state: State) -> Vector3:
-        """Torques [N m] at a time [s], and a state where it is an argument."""
-        value = self._function(t, *state)
+    def at(self, time: float, *state: State) -> Vector3:
+        """See `TorqueProfile`."""
+        value = self._function(time, *state)
         vector = finite_vector(value)
-        return _three(value, f"torque({t:g})") if vector is None else vector
+        return _three(value, f"torque({time:g})") if vector is None else vector
+
+    __call__ = at
+
+    def at_times(self, times: Sequence[float]) -> list[Vector3]:
+        """See `TorqueProfile`; the values are checked together."""
+        values: list[Any] = [self._function(time) for time in times]
+        if _are_plain_vectors(values):
+            return values
+        return super().at_times(times)
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
         if self.feedback:
             return super().values(t)
-        return np.array([self(float(time)) for time in t]).reshape(-1, 3)
+        return np.array(self.at_times(t.tolist())).reshape(-1, 3)
+
+    def record(self) -> dict[str, Any]:
+        """Return the kind alone: a function is in no file."""
+        return {"kind": self.kind}
+
+
+def _are_plain_vectors(values: Sequence[Any]) -> bool:
+    """Return whether all values are tuples of three finite floats."""
+    if set(map(type, values)) != {tuple} or set(map(len, values)) != {3}:
+        return False
+    numbers = list(chain.from_iterable(values))
+    return set(map(type, numbers)) == {float} and math.isfinite(sum(numbers))
 
 
 def _three(value: Any, name: str) -> Vector3:
@@ -360,6 +439,8 @@ class TorqueTable(TorqueProfile):
     InputError is raised where shapes, order or numbers are not allowed.
     """
 
+    kind = "table"
+
     @check_kinds
     def __init__(self, times: TimesLike, torques: ArrayLike) -> None:
         self.times = freeze(read_numbers("torque table", "times", times, seconds=True))
@@ -401,7 +482,7 @@ class TorqueTable(TorqueProfile):
         times, torques = _read_rows(origin, header, lines)
         return cls(times, torques)
 
-    __call__ = _at
+    __call__ = TorqueProfile.at
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -412,23 +493,16 @@ class TorqueTable(TorqueProfile):
         """See `TorqueProfile`."""
         return self.times
 
-    def acting(self, begin: float, end: float) -> Vector3:
+    def piece(self, begin: float, end: float) -> TorqueProfile:
         """See `TorqueProfile`."""
-        return self(0.5 * (begin + end))
+        return ConstantTorque(self.at(0.5 * (begin + end)))
 
 
-Torque = Vector3 | SineTorque | TorqueFunction
-"""A function is called with the time [s], and the `State` if `feedback` is true."""
+Torque: TypeAlias = Vector3 | TorqueProfile
+"""What acts over a period of the integrator: torques that are held, or smooth ones."""
 
-
-def torque_at(torque: Any, *time_and_state: Any) -> Any:
-    """Return the torques [N m] of numbers, a sine or a function.
-
-    `time_and_state` are the time [s] and, where a function asks for it, the `State`.
-    """
-    if isinstance(torque, SineTorque):
-        return torque.at(*time_and_state)
-    return torque(*time_and_state) if callable(torque) else torque
+TorqueLike: TypeAlias = Sequence[float] | TorqueProfile | TorqueFunction | None
+"""Torques as a user gives them; by default those of the scene."""
 
 
 def profile_of(torque: Any) -> TorqueProfile:
@@ -446,37 +520,17 @@ def profile_of(torque: Any) -> TorqueProfile:
     return ConstantTorque(torque)
 
 
-_PROFILE_KINDS = {
-    "constant": ConstantTorque, "sine": SineTorque, "table": TorqueTable,
-    "polynomial": PolynomialTorque, "function": TorqueProfile,
-}  # fmt: skip
-
-
-def record_of(profile: TorqueProfile) -> dict[str, Any]:
-    """Return kind and numbers of a profile.
-
-    `profile_from` builds it again from these.
-    """
-    record: dict[str, Any] = {"kind": _kind_of(profile)}
-    if record["kind"] != "function":
-        for name, numbers in vars(profile).items():
-            record[name] = np.asarray(numbers).tolist()
-    return record
-
-
-def _kind_of(profile: TorqueProfile) -> str:
-    for kind, profile_class in _PROFILE_KINDS.items():
-        if isinstance(profile, profile_class):
-            return kind
-    return "function"
+_KINDS = (ConstantTorque, SineTorque, TorqueTable, PolynomialTorque)
+_PROFILE_KINDS: dict[str, Callable[..., TorqueProfile]] = {
+    profile.kind: profile for profile in _KINDS
+}
 
 
 def profile_from(record: dict[str, Any]) -> TorqueProfile:
-    """Build the profile that `record_of` has described."""
+    """Build the profile that `TorqueProfile.record` has described."""
     kind, *numbers = record.values()
-    if kind == "function":
+    if kind == TorqueProfile.kind:
         return LostTorque()
-    if kind == "sine":
+    if kind == SineTorque.kind:
         return SineTorque(**dict(zip(SineTorque.SPECS, numbers, strict=True)))
-    profile: TorqueProfile = _PROFILE_KINDS[kind](*numbers)
-    return profile
+    return _PROFILE_KINDS[kind](*numbers)

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.integration.applied_torque import has_feedback
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
-from sst_ros.integration.point import Drive, Step
+from sst_ros.integration.point import Step
 from sst_ros.integration.stepper import Stepper
-from sst_ros.scene.torque_profile import SineTorque, Torque
+from sst_ros.scene.torque_profile import Torque
 from sst_ros.state import Array
 
 _STATE_NUMBERS = 7
@@ -100,7 +99,7 @@ class Samples:
             states[list(rows)] = known
         self._step_to(t, states)
         joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE_NUMBERS])
-        torque = self._torque_at(t, states)
+        torque = self._torque_at(t, states, joints)
         return SampleTable(
             t, states[:, :4], states[:, 4:_STATE_NUMBERS], torque, joints
         )
@@ -119,28 +118,26 @@ class Samples:
             x = t[numbers] - np.array([run.begin for run in runs]).repeat(counts)
             states[numbers] = taken[0].steps.states_inside(taken, counts, x)
 
-    def _torque_at(self, t: Array, states: Array) -> Array:
+    def _torque_at(self, t: Array, states: Array, joints: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
         # the actuators lag: they are part of the state
         if states.shape[1] > _STATE_NUMBERS + 1:
             return states[:, _STATE_NUMBERS : _STATE_NUMBERS + 3]
         torques = np.empty((len(t), 3))
+        applied = self._stepper.torque
         ends = [first for first, _ in self._torques[1:]]
-        sines: list[int] = []
         for (first, torque), end in zip(self._torques, [*ends, len(t)], strict=True):
-            if isinstance(torque, SineTorque):
-                sines += range(first, end)
-                sine = torque  # one, traced into the program
-            elif callable(torque) and not has_feedback(torque):
-                evaluate = self._stepper.torque.of_time(Drive((), torque))
-                torques[first:end] = [evaluate(time) for time in t[first:end].tolist()]
-            elif callable(torque):
-                for k in range(first, end):
-                    torques[k] = self._stepper.torque.at(
-                        torque, float(t[k]), states[k].tolist()
-                    )
-            else:
+            if isinstance(torque, tuple):
                 torques[first:end] = torque
-        if sines:
-            torques[sines] = sine.values(t[sines])
+            elif torque.feedback:
+                part = slice(first, end)
+                rows = (array[part].tolist() for array in (t, states, joints))
+                torques[part] = [
+                    applied.of_state(torque, time, state, angles)
+                    for time, state, angles in zip(*rows, strict=True)
+                ]
+            elif self._stepper.traced_sine(torque) is not None:
+                torques[first:end] = torque.values(t[first:end])
+            else:
+                torques[first:end] = applied.at_times(torque, t[first:end].tolist())
         return torques

@@ -25,12 +25,10 @@ from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET, EvaluationBudget
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.removed import REMOVED_METHODS
 from sst_ros.scene.loads import Initial
-from sst_ros.scene.scene import SceneInput, scene_of, with_initial
+from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.scene.torque_profile import (
-    FeedbackFunction,
     FunctionTorque,
-    SineTorque,
-    TorqueFunction,
+    TorqueLike,
     TorqueProfile,
     TorqueTable,
     ascend,
@@ -78,14 +76,6 @@ answer.
 
 _METHOD_WORDS = "must be one of " + ", ".join(INTEGRATORS)
 
-TorqueInput: TypeAlias = (
-    Sequence[float]
-    | SineTorque
-    | TorqueProfile
-    | TorqueFunction
-    | FeedbackFunction
-    | None
-)
 InitialInput: TypeAlias = (
     Initial | Mapping[str, Any] | tuple[ArrayLike, ArrayLike] | None
 )
@@ -94,7 +84,7 @@ InitialInput: TypeAlias = (
 @check_kinds
 def simulate(
     scene: SceneInput,
-    torque: TorqueInput = None,
+    torque: TorqueLike = None,
     duration: float | None = None,
     *,
     initial: InitialInput = None,
@@ -160,47 +150,79 @@ def simulate(
 
     """
     refuse_other_rounding("simulate")
-    given = with_initial(scene_of(scene), initial)
+    # Read what moves, what acts on it, and for how long.
+    moving = with_initial(scene_of(scene), initial)
+    profile = _read_torque(torque, moving)
+    span_ns = _read_duration(duration, moving)
+    # Read how it is integrated.
+    _check_method(method, tolerance)
+    period = _read_period(control_period, profile, span_ns)
+    longest = _read_longest_step(max_step, span_ns)
+    jumps = _read_breaks(breaks, span_ns)
+    # Read what is asked for.
+    times = _read_times(samples, t_eval, span_ns, period)
+    parameters = _read_parameters(sensitivities, moving, profile)
+    # Run it until its error estimate meets the tolerance.
+    task = Task(
+        moving, profile, (0.0, span_ns / NANOSECONDS), times, method, tolerance,
+        period, memoryless, jumps, longest, parameters,
+    )  # fmt: skip
+    return _run_to_tolerance(task, progress=progress)
+
+
+def _read_torque(torque: TorqueLike, scene: Scene) -> TorqueProfile:
+    """Return the torques as a profile, by default those of the scene, or zero."""
     if torque is None:
-        torque = (0.0, 0.0, 0.0) if given.torque is None else given.torque
-    profile = profile_of(torque)
-    length = given.duration if duration is None else duration
+        torque = scene.torque
+    return profile_of((0.0, 0.0, 0.0) if torque is None else torque)
+
+
+def _read_duration(duration: float | None, scene: Scene) -> int:
+    """Return the length of the motion [ns], by default that of the scene."""
+    length = scene.duration if duration is None else duration
     if length is None:
         _refuse("duration", None, "must be given: the scene has none")
-    span_ns = _nanoseconds("duration", length)
-    jumps = np.atleast_1d(read_numbers("simulate", "breaks", breaks, seconds=True))
-    longest = math.inf if max_step is None else max_step
-    end = span_ns / NANOSECONDS
-    least = end / _MOST_PERIODS
-    shortest = f"must be > 0 s, at least {least:.3g} s for this duration"
+    return _nanoseconds("duration", length)
+
+
+def _check_method(method: str, tolerance: float) -> None:
+    """Refuse a method that is none, and a tolerance that is not a positive number."""
+    is_tolerance = 0.0 < tolerance < math.inf
     refuse_unless(
         "simulate",
         ("method", method, method in INTEGRATORS, _allow_methods(method)),
-        (
-            "tolerance",
-            tolerance,
-            0.0 < tolerance < math.inf,
-            "must be a number > 0 [rad]",
-        ),
-        ("max_step", max_step, longest >= least, shortest),
-        ("breaks", breaks, ascend(jumps), "must be ascending times [s]"),
+        ("tolerance", tolerance, is_tolerance, "must be a number > 0 [rad]"),
     )
-    period = _check_period(control_period, profile, span_ns)
-    inside = jumps[(jumps > 0.0) & (jumps < end)]
-    times = _times(samples, t_eval, span_ns, period)
-    parameters = (
-        (sensitivities,) if isinstance(sensitivities, str) else tuple(sensitivities)
-    )
-    if parameters:  # refuses what no motion is differentiated by
-        Sensitivities(given, parameters, profile)
-    task = Task(
-        given, profile, (0.0, end), times, method, tolerance, period, memoryless,
-        inside, float(longest), parameters,
-    )  # fmt: skip
-    return _integrate(task, progress=progress)
 
 
-def _integrate(task: Task, *, progress: bool) -> Trajectory:
+def _read_longest_step(max_step: float | None, span_ns: int) -> float:
+    """Return the longest step [s]."""
+    longest = math.inf if max_step is None else float(max_step)
+    least = span_ns / NANOSECONDS / _MOST_PERIODS
+    allowed = f"must be > 0 s, at least {least:.3g} s for this duration"
+    refuse_unless("simulate", ("max_step", max_step, longest >= least, allowed))
+    return longest
+
+
+def _read_breaks(breaks: TimesLike, span_ns: int) -> Array:
+    """Return the times inside the motion [s] at which a function jumps."""
+    times = np.atleast_1d(read_numbers("simulate", "breaks", breaks, seconds=True))
+    allowed = "must be ascending times [s]"
+    refuse_unless("simulate", ("breaks", breaks, ascend(times), allowed))
+    return np.asarray(times[(times > 0.0) & (times < span_ns / NANOSECONDS)])
+
+
+def _read_parameters(
+    sensitivities: Sequence[str], scene: Scene, profile: TorqueProfile
+) -> tuple[str, ...]:
+    """Return the names that the motion is differentiated by."""
+    names = (sensitivities,) if isinstance(sensitivities, str) else sensitivities
+    if names:
+        Sensitivities(scene, names, profile)  # refuses what no motion is derived by
+    return tuple(names)
+
+
+def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
     """Run a motion by steps, again by smaller ones if the tolerance is not met.
 
     It is met where the error estimate does not exceed it.
@@ -302,9 +324,7 @@ def _nanoseconds(name: str, value: float) -> int:
     return round(float(value) * NANOSECONDS)
 
 
-def _check_period(
-    period: float | None, profile: TorqueProfile, span: int
-) -> int | None:
+def _read_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
     if period is None:
         return None
     if not isinstance(profile, FunctionTorque):
@@ -313,24 +333,24 @@ def _check_period(
             period,
             "is for a function; give none for numbers and profiles",
         )
-    found = _nanoseconds("control_period", period)
-    if span > _MOST_PERIODS * found:
+    length = _nanoseconds("control_period", period)
+    if span > _MOST_PERIODS * length:
         least = span / NANOSECONDS / _MOST_PERIODS
         _refuse(
             "control_period",
             period,
             f"must be at least {least:.3g} s for this duration",
         )
-    return found
+    return length
 
 
-def _times(
+def _read_times(
     samples: int | None, t_eval: TimesLike | None, span_ns: int, period: int | None
 ) -> Array:
     """Return the times of the samples [s], in whole nanoseconds."""
     if t_eval is None:
         if samples is None and period is not None:
-            found = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
+            even = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
         else:
             count = _DEFAULT_SAMPLES if samples is None else samples
             if not 1 <= count <= _MOST_SAMPLES:
@@ -339,8 +359,8 @@ def _times(
                     samples,
                     f"must be a whole number from 1 to {_MOST_SAMPLES}",
                 )
-            found = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
-        return np.asarray(found / NANOSECONDS)
+            even = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
+        return np.asarray(even / NANOSECONDS)
     if samples is not None:
         _refuse("samples", samples, "must be None where t_eval gives their times")
     times = np.atleast_1d(read_numbers("simulate", "t_eval", t_eval, seconds=True))

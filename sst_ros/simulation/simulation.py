@@ -15,6 +15,7 @@ from sst_ros.dynamics.initial_state import derive_by_paper, start_of
 from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
 from sst_ros.errors import (
     Diverged,
+    SstError,
     StepBudgetExceeded,
     check_kinds,
     refusal,
@@ -34,7 +35,13 @@ from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Geometry, rotation_matrix
 from sst_ros.programs.llvm import llvmlite_version
 from sst_ros.scene.scene import SceneInput, scene_of
-from sst_ros.scene.torque_profile import SineTorque, Torque, count_arguments
+from sst_ros.scene.torque_profile import (
+    Torque,
+    TorqueFunction,
+    TorqueProfile,
+    count_arguments,
+    profile_of,
+)
 from sst_ros.state import (
     NANOSECONDS,
     ZERO,
@@ -186,7 +193,10 @@ class Simulation(Explained):
         self.reset()
 
     def step(
-        self, torque: Torque, dt_ns: int, moment: Vector3 = (0.0, 0.0, 0.0)
+        self,
+        torque: Torque | TorqueFunction,
+        dt_ns: int,
+        moment: Vector3 = (0.0, 0.0, 0.0),
     ) -> State:
         """Advance by dt_ns [ns] in as many steps as the tolerance asks for.
 
@@ -206,34 +216,51 @@ class Simulation(Explained):
                 was.
 
         """
-        self.steps(torque, dt_ns, 1, moment)
+        acting, length, _ = self._read_steps(torque, dt_ns, 1, moment)
+        self.advance(acting, length, 1, moment)
         return self.state
 
     def steps(
-        self, torque: Torque, dt_ns: int, count: int, moment: Vector3 = (0.0, 0.0, 0.0)
+        self,
+        torque: Torque | TorqueFunction,
+        dt_ns: int,
+        count: int,
+        moment: Vector3 = (0.0, 0.0, 0.0),
     ) -> None:
         """Advance by `count` times dt_ns, bit for bit as by `count` calls of `step`.
 
         Errors are those of `step`: the state is then that after the last step before,
         at `time_ns`.
         """
-        length, number = _whole(dt_ns), _whole(count)
-        numbers, field = finite_vector(torque), finite_vector(moment)
-        is_whole = 0 < number <= _MOST_CALL_STEPS and length > 0
-        if not (is_whole and numbers and field):
-            acts = callable(torque) or isinstance(torque, SineTorque) or numbers
+        acting, length, number = self._read_steps(torque, dt_ns, count, moment)
+        self.advance(acting, length, number, moment)
+
+    def _read_steps(
+        self,
+        torque: Torque | TorqueFunction,
+        dt_ns: int,
+        count: int,
+        moment: Vector3,
+    ) -> tuple[Torque, int, int]:
+        """Return what acts, the length of a step [ns] and the number of steps."""
+        length = _whole(dt_ns)
+        number = _whole(count)
+        held = finite_vector(torque)
+        are_counted = length > 0 and 0 < number <= _MOST_CALL_STEPS
+        if held is None or finite_vector(moment) is None or not are_counted:
+            is_torque = held is not None or callable(torque)
+            is_torque = is_torque or isinstance(torque, TorqueProfile)
+            is_moment = finite_vector(moment) is not None
             refuse_unless(
                 "step",
-                ("torque", torque, bool(acts), _TORQUE_WORDS),
-                ("moment", moment, field is not None, _THREE),
+                ("torque", torque, is_torque, _TORQUE_WORDS),
+                ("moment", moment, is_moment, _THREE),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
                 ("count", count, 0 < number <= _MOST_CALL_STEPS, _COUNT),
             )
-        if numbers:
-            acting = self._stepper.torque.acting(numbers)
-        else:
-            acting = self.acting(torque)
-        self.advance(acting, length, number, moment)
+        if held is None:
+            return self.acting(torque), length, number
+        return self._stepper.torque.acting(held), length, number
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy the arguments, and where the run is."""
@@ -251,53 +278,53 @@ class Simulation(Explained):
             raise refusal("step", "thread", here, allowed)
         self._thread = threading.get_ident()
 
-    def acting(self, torque: Torque) -> Torque:
+    def acting(self, torque: Torque | TorqueFunction) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
-        try:
-            if callable(torque) and not getattr(torque, "feedback", False):
-                refuse_unless(
-                    "step",
-                    ("torque", torque, count_arguments(torque) == 1, _TORQUE_WORDS),
-                )
-            acts = callable(torque) or isinstance(torque, SineTorque)
-            if not acts and finite_vector(torque) is None:
-                raise ValueError
-            return self._stepper.torque.acting(torque)
-        except (TypeError, ValueError, OverflowError):
-            raise refusal("step", "torque", torque, _TORQUE_WORDS) from None
+        held = finite_vector(torque)
+        if held is not None:
+            return self._stepper.torque.acting(held)
+        if not isinstance(torque, TorqueProfile):
+            is_function = callable(torque) and count_arguments(torque) == 1
+            refuse_unless("step", ("torque", torque, is_function, _TORQUE_WORDS))
+        return self._stepper.torque.acting(profile_of(torque))
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
         """Do what `steps` does, for arguments that have been checked.
 
         Torque is of `acting`.
         """
+        h = dt_ns / NANOSECONDS
+        acting_moment: tuple[float, ...] = ()
+        if self.dynamics.has_moment_topic:
+            acting_moment = tuple(map(float, moment))
+        # One thread at a time: what follows reads where the run is, and moves it.
         self._claim()
+        began = self._now
         try:
-            self._advance(torque, dt_ns, count, moment)
+            for _ in range(count):
+                now = self._now
+                start = now.time_ns / NANOSECONDS
+                # Take steps of the integrator up to the end of the period.
+                try:
+                    point = self._stepper.advance(
+                        now.point, start, h, torque, acting_moment
+                    )
+                except (LimitReached, CannotStep) as stop:
+                    raise self._explain(stop, start) from None
+                # What it reached is the state now; until here nothing has changed.
+                self._before = began
+                self._now = _Instant(now.time_ns + dt_ns, point, torque, acting_moment)
         finally:
             self._running.release()
 
-    def _advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
-        h, began = dt_ns / NANOSECONDS, self._now
-        held = tuple(map(float, moment)) if self.dynamics.has_moment_topic else ()
-        for _ in range(count):
-            time_ns, at, *_ = self._now
-            start = time_ns / NANOSECONDS
-            try:
-                point = self._stepper.advance(at, start, h, torque, held)
-            except LimitReached as reached:
-                assert reached.limit.error is not None
-                raise reached.limit.error(
-                    reached.limit.reason, reached.time, self.state
-                ) from None
-            except CannotStep as error:
-                kind = (
-                    StepBudgetExceeded if isinstance(error, BudgetSpent) else Diverged
-                )
-                near = describe_conditioning(self.geometry, self.state)
-                raise kind(f"{error} ({near})", start, self.state) from None
-            self._before = began
-            self._now = _Instant(time_ns + dt_ns, point, torque, held)
+    def _explain(self, stop: LimitReached | CannotStep, start: float) -> SstError:
+        """Return the error by which a step that began at a time [s] ends."""
+        if isinstance(stop, LimitReached):
+            assert stop.limit.error is not None
+            return stop.limit.error(stop.limit.reason, stop.time, self.state)
+        near = describe_conditioning(self.geometry, self.state)
+        kind = StepBudgetExceeded if isinstance(stop, BudgetSpent) else Diverged
+        return kind(f"{stop} ({near})", start, self.state)
 
     @check_kinds
     def within(self, time_ns: int) -> State:

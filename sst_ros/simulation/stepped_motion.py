@@ -28,7 +28,7 @@ from sst_ros.integration.stepper import (
 )
 from sst_ros.progress import Bar
 from sst_ros.scene.scene import Scene
-from sst_ros.scene.torque_profile import Torque, TorqueProfile, torque_at
+from sst_ros.scene.torque_profile import Torque, TorqueProfile
 from sst_ros.simulation.samples import Samples
 from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
 
@@ -146,7 +146,7 @@ class SteppedMotion:
             kinks = np.union1d(task.breaks, kinks)
         inside = kinks[(kinks > begin) & (kinks < end)].tolist()
         for start, stop in pairwise([begin, *inside, end]):
-            self._advance(start, stop - start, stop, task.torque.acting(start, stop))
+            self._advance(start, stop - start, stop, task.torque.piece(start, stop))
 
     def _hold_periods(self, period: int) -> None:
         """Go through control periods, which hold the torques of a function."""
@@ -155,7 +155,7 @@ class SteppedMotion:
             time = start / NANOSECONDS
             self._take_if_wanted(time, self.at.y)
             state = (self.state(),) if task.torque.feedback else ()
-            held = torque_at(task.torque, time, *state)
+            held = task.torque.at(time, *state)
             self.held.append((time, held))
             if task.torque.feedback and task.memoryless:
                 self._other = self._answer_second(time)
@@ -166,7 +166,7 @@ class SteppedMotion:
         """Return what a function without memory gives to the second solution [N m]."""
         at = self.stepper.begin(self.at.z)
         before = self._torque if self._other is None else self._other
-        torque = torque_at(self._task.torque, time, self._state_of(at, before))
+        torque = self._task.torque.at(time, self._state_of(at, before))
         return clamp(torque, self.stepper.torque.limit)
 
     def _advance(self, begin: float, h: float, end: float, torque: Torque) -> None:

@@ -47,7 +47,6 @@ from sst_ros.scene.torque_profile import (
     ascend,
     profile_from,
     profile_of,
-    record_of,
 )
 from sst_ros.scene.yaml_document import dump, read
 from sst_ros.simulation.stepped_motion import SteppedMotion, Task
@@ -540,7 +539,7 @@ class Trajectory(MotionTable):
         about = self._of_run() | {
             "format": _FORMAT,
             "scene": dump(self.scene),
-            "torque": self.law and record_of(self.law),
+            "torque": self.law and self.law.record(),
             "gaps": self.gaps.tolist(),
         }
         units = {name: {"unit": unit} for name, unit in MOTION_UNITS.items()}
