@@ -421,7 +421,7 @@ def run(command_line: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
     The signal handlers of rclpy would cut the connection at once; ours let the worker
-    close. The command line is a key of `settings.NODE_COMMANDS` and the arguments behind it. The
+    close. The command line is the name of a node and the arguments behind it. The
     exit status is 0, 1 for a failure, 2 for arguments that are refused.
     """
     status = _run(command_line)
