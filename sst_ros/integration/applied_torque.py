@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,28 @@ _STATE_STEP = 1e-7
 
 Half of the digits remain.
 """
+WATCHED = 32
+"""Parts of a step at whose ends a function of the time is looked at.
+
+A pulse that is longer than one of them is met.
+"""
+_PULSE = 1e-3
+"""Deviation from the neighbours that may be a jump, relative to the largest torque."""
+_SMOOTH_PULSE = 0.1
+"""...and one that is a smooth pulse, as no jump is found."""
 _NOT_FINITE = (math.nan, math.nan, math.nan)
+
+
+_EXTRAPOLATION = np.array([4.0, -6.0, 4.0, -1.0])
+"""Weights of four evenly spaced values in the one before them, by a cubic."""
+
+
+class Pulse(NamedTuple):
+    """Where a torque does not follow from its neighbours."""
+
+    begin: float  # time of the steps [s]
+    end: float
+    is_large: bool  # so that a step must not pass it, even if it is smooth
 
 
 class AppliedTorque:
@@ -136,6 +158,31 @@ class AppliedTorque:
             if not math.dist(before, after) > 0.5 * largest:
                 return None
         return low, high
+
+    def find_pulse(self, drive: Drive, t: float, h: float) -> Pulse | None:
+        """Find where a function of the time does not follow from its neighbours.
+
+        Each of evenly spaced torques in a step is compared with the cubic polynomial
+        through two on either side, or through four on one side near the ends. At the
+        ends themselves are stages.
+        """
+        assert drive.function is not None
+        spacing = h / WATCHED
+        times = [drive.start + t + spacing * k for k in range(WATCHED + 1)]
+        torques = np.array(self.at_times(drive.function, times))
+        expected = torques.copy()
+        inner = 4.0 * (torques[1:-3] + torques[3:-1]) - torques[:-4] - torques[4:]
+        expected[2:-2] = inner / 6.0
+        expected[1] = _EXTRAPOLATION @ torques[2:6]
+        expected[-2] = _EXTRAPOLATION @ torques[-3:-7:-1]
+        deviations = np.abs(torques - expected).max(axis=1)
+        k = int(deviations.argmax())
+        largest = float(np.abs(torques).max())
+        deviation = float(deviations[k])
+        if not deviation > _PULSE * largest:
+            return None
+        begin, end = t + spacing * (k - 1), t + spacing * (k + 1)
+        return Pulse(begin, end, deviation > _SMOOTH_PULSE * largest)
 
     def rate(
         self, drive: Drive, t: float, y: Sequence[float], torque: Vector3

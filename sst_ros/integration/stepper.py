@@ -87,6 +87,13 @@ _SHORTEST_SEARCH = 1e-13
 
 It would lie within rounding.
 """
+_UNWATCHED = 1e-3
+"""Longest steps [s] that are not looked at for pulses, such as ticks of a simulation.
+
+No more than 0.3 ms lie between their stages.
+"""
+_MOST_LOOKS = 60
+"""Times that a step is made shorter for a pulse: by halves down to rounding."""
 _JUMP_MARGIN = 4e-16
 """Relative to the time: distance of steps from a jump, before it and after it."""
 _BEHIND_A_KINK = 1e-14
@@ -368,7 +375,7 @@ class Stepper:
         `stops` are the times just before and after a jump that was found, where steps
         end; `steps` those that the last step was taken by.
         """
-        rejected = leaps = 0
+        rejected = leaps = looks = 0
         while True:
             if steps.method is not at.method:
                 steps = self._steps_of(drive, at.method)
@@ -382,6 +389,10 @@ class Stepper:
             after, size, stages = steps.pair(t, h, at, drive, other)
             error = size / self._tolerance
             if size <= self._tolerance:
+                if looks < _MOST_LOOKS and self._meets_pulse(t, h, at, drive, stops):
+                    looks += 1
+                    at = at._replace(h=h if stops else 0.5 * h)
+                    continue
                 ends = at.joints, after.joints
                 passed = largest_passed(self._transitions, *ends)
                 if passed > 1.0:
@@ -464,16 +475,46 @@ class Stepper:
         self, t: float, h: float, y: Sequence[float], drive: Drive
     ) -> list[float]:
         """Return times just before and after a torque's jump in a step, if any."""
-        if drive.function is None:
+        if drive.function is None or h < _SHORTEST_SEARCH * max(
+            abs(drive.start + t), h
+        ):
             return []
-        time = drive.start + t
-        if h < _SHORTEST_SEARCH * max(abs(time), h):
-            return []
-        jump = self.torque.locate_jump(drive, t, t + h, y)
+        return self._stops_at_jump(t, t + h, y, drive, t, h)
+
+    def _stops_at_jump(
+        self,
+        begin: float,
+        end: float,
+        y: Sequence[float],
+        drive: Drive,
+        t: float,
+        h: float,
+    ) -> list[float]:
+        """Return times around a jump between two times in the step from t, if any."""
+        jump = self.torque.locate_jump(drive, begin, end, y)
         if jump is None:
             return []
         margin = _JUMP_MARGIN * max(abs(drive.start + jump[1]), h)
         return [stop for stop in (jump[0] - margin, jump[1] + margin) if stop > t]
+
+    def _meets_pulse(
+        self, t: float, h: float, at: Point, drive: Drive, stops: list[float]
+    ) -> bool:
+        """Return whether a step passes over a pulse of a function of the time.
+
+        Its stages may have met nothing of it. Where the pulse begins or ends by a jump
+        the times around that become `stops`.
+        """
+        if drive.function is None or drive.function.feedback or h <= _UNWATCHED:
+            return False
+        pulse = self.torque.find_pulse(drive, t, h)
+        if pulse is None:
+            return False
+        edges = self._stops_at_jump(pulse.begin, pulse.end, at.y, drive, t, h)
+        if edges and edges != stops:
+            stops[:] = edges
+            return True
+        return pulse.is_large and not edges
 
     def _until_event(self, step: Step) -> tuple[Step, Limit | None]:
         """Return an accepted step up to the first event in it, and that, or all of it.
