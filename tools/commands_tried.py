@@ -177,7 +177,6 @@ SESSIONS = {
             _echo(f"{NODE}/imu", "frame_id: imu_link"),
             _echo(f"{NODE}/reaction", "force:"),
             Row("ros2 topic hz --window 200 /joint_states", "average rate", 0, 40.0),
-            Row(f"ros2 topic bw {NODE}/imu", "B/s", 1, 40.0),
             Row(
                 f'ros2 topic pub --once {NODE}/commands {FLOATS} "{{data: [0, 0, 0]}}"',
                 "publishing #1",
