@@ -196,21 +196,21 @@ def compare(watch: Client, seconds: float, rounds: int) -> str:
     Markdown, a row for each, a table for each cpu_dma_latency.
     """
     settings = {-1: "no limit of the exit latency, the default"}
-    said = scheduling.CpuDmaLatency().request(0)
-    if scheduling.NO_LIMIT not in said:
+    table_text = scheduling.CpuDmaLatency().request(0)
+    if scheduling.NO_LIMIT not in table_text:
         settings[0] = "`cpu_dma_latency` 0"
-    found: dict[tuple[int, str], list[dict[str, float]]] = {
+    medians: dict[tuple[int, str], list[dict[str, float]]] = {
         (latency_us, name): [] for name in (NODE, *LOOPS) for latency_us in settings
     }
     for _ in range(rounds):
-        for (latency_us, name), runs in found.items():
+        for (latency_us, name), runs in medians.items():
             runs.append(measure(watch, name, seconds, latency_us))
     tables = []
     for latency_us, title in settings.items():
-        least = [run["processor"] for run in found[latency_us, LEAST]]
+        least = [run["processor"] for run in medians[latency_us, LEAST]]
         rows = []
         for name in (NODE, *LOOPS):
-            runs = found[latency_us, name]
+            runs = medians[latency_us, name]
             used = [run["processor"] for run in runs]
             ratio = median(a / b for a, b in zip(used, least, strict=True))
             row = {
@@ -223,7 +223,7 @@ def compare(watch: Client, seconds: float, rounds: int) -> str:
             rows.append(row)
         tables.append(markdown(data_frame(rows)))
     if 0 not in settings:
-        tables.append(f"With `cpu_dma_latency` 0: {said}.")
+        tables.append(f"With `cpu_dma_latency` 0: {table_text}.")
     return "\n\n".join(tables)
 
 

@@ -77,21 +77,21 @@ void batch(long n, const double *restrict s, double **ins, double **outs) {{
 
 def has_gcc() -> bool:
     """Whether there is a compiler; says so where there is none."""
-    found = shutil.which("gcc") is not None
-    if not found:
+    path = shutil.which("gcc") is not None
+    if not path:
         print(
             "gcc is missing: NO C FLOOR. Only Python and its machine code are timed.",
             file=sys.stderr,
         )
-    return found
+    return path
 
 
 def read_version() -> str:
     """First line of gcc --version."""
-    done = subprocess.run(
+    process = subprocess.run(
         ["gcc", "--version"], capture_output=True, text=True, check=True
     )
-    return done.stdout.splitlines()[0].removeprefix("gcc ")
+    return process.stdout.splitlines()[0].removeprefix("gcc ")
 
 
 def compile_c(
@@ -101,8 +101,8 @@ def compile_c(
     file, library = folder / f"{name}.c", folder / f"{name}.so"
     file.write_text(text, encoding="utf-8")
     command = ["gcc", *flags, "-shared", "-fPIC", "-o", str(library), str(file), "-lm"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return ctypes.CDLL(str(library)), done.stderr
+    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    return ctypes.CDLL(str(library)), process.stderr
 
 
 def write_step(program: Program, tableau: Tableau) -> str:

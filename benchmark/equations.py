@@ -153,8 +153,10 @@ def find_difference(
             drive = package.drive if output.startswith("derivative") else []
             result = call(output, state, drive)
             result = result.tolist() if hasattr(result, "tolist") else result
-            found = np.array(result, dtype=float).reshape(expected.shape)
-            worst = max(worst, np.abs(found - expected).max() / np.abs(expected).max())
+            differences = np.array(result, dtype=float).reshape(expected.shape)
+            worst = max(
+                worst, np.abs(differences - expected).max() / np.abs(expected).max()
+            )
     return worst
 
 
@@ -376,10 +378,10 @@ def measure_sizes(name: str) -> dict[str, str]:
                 made = str(source.with_suffix(".o"))
                 words = [compiler, "-std=c99", "-Os", *flags, "-c", "-o", made]
                 subprocess.run([*words, str(source)], check=True)
-                done = subprocess.run(
+                process = subprocess.run(
                     [size, made], check=True, capture_output=True, text=True
                 )
-            text, data = map(int, done.stdout.splitlines()[1].split()[:2])
+            text, data = map(int, process.stdout.splitlines()[1].split()[:2])
             row[f"{said}, {machine}"] = f"{(text + data) / 1000:.1f} kB"
     return row
 
@@ -412,8 +414,8 @@ def compilers() -> str:
     for compiler in ("cc", "arm-none-eabi-gcc"):
         if shutil.which(compiler):
             words = [compiler, "--version"]
-            done = subprocess.run(words, check=True, capture_output=True, text=True)
-            lines.append(done.stdout.splitlines()[0])
+            process = subprocess.run(words, check=True, capture_output=True, text=True)
+            lines.append(process.stdout.splitlines()[0])
     return "; ".join(lines)
 
 

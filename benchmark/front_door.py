@@ -287,9 +287,9 @@ def _prepare_mujoco(setting: MuJoCo) -> Callable[[], Any]:
     from benchmark.peers import mujoco_peer
     from benchmark.peers.task import Task
 
-    kind = mujoco_peer.Python if setting.python else mujoco_peer.Compiled
+    runner = mujoco_peer.Python if setting.python else mujoco_peer.Compiled
     arguments = Task(), "RK4", setting.mobility, setting.settle, setting.steps
-    return kind(*arguments).run
+    return runner(*arguments).run
 
 
 def measure_steps(rounds: int) -> str:

@@ -202,9 +202,9 @@ def main(arguments: list[str] | None = None) -> int:
         summary = json.loads(
             (Path(folder) / "report" / "summary.json").read_text(encoding="utf-8")
         )
-    found = {"bag_GB": size, "wall_s": wall, "processor_s": busy, "peak_GB": memory}
-    found |= {name: summary[name] for name in SHOWN}
-    for name, value in found.items():
+    recording = {"bag_GB": size, "wall_s": wall, "processor_s": busy, "peak_GB": memory}
+    recording |= {name: summary[name] for name in SHOWN}
+    for name, value in recording.items():
         print(
             f"{name:40} {value:.4g}"
             if isinstance(value, float)

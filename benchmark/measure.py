@@ -163,47 +163,48 @@ class Costs:
         }
         self.floor = floor
 
-    def ratio(self, work: str, who: str, other: str) -> float | None:
+    def ratio(self, work: str, name: str, reference: str) -> float | None:
         """Median over the rounds of a cost over another's.
 
         None where one is not known.
         """
-        if (work, who) not in self._ns or (work, other) not in self._ns:
+        if (work, name) not in self._ns or (work, reference) not in self._ns:
             return None
-        return divide(self._ns, (work, who), (work, other))
+        return divide(self._ns, (work, name), (work, reference))
 
-    def judge(self, work: str, who: str, other: str, target: float) -> None:
+    def judge(self, work: str, name: str, reference: str, target: float) -> None:
         """Print whether a ratio of at most `target` is met."""
-        value = self.ratio(work, who, other)
+        value = self.ratio(work, name, reference)
         if value is not None:
             verdict = "met" if value <= target else "MISSED"
-            print(f"{work}: {who} over {other} {value:.2f}, target {target}: {verdict}")
+            ratio = f"{work}: {name} over {reference} {value:.2f}"
+            print(f"{ratio}, target {target}: {verdict}")
 
     def print(self) -> None:
         """Print the medians, and the ratios to the floor where they are known."""
         print(f"{'work':18}{'who':38}{'ns':>10}{'over ' + self.floor:>16}")
-        for work, who in self._ns:
-            over = self.ratio(work, who, self.floor)
+        for work, name in self._ns:
+            over = self.ratio(work, name, self.floor)
             said = "" if over is None else f"{over:.2f}"
-            print(f"{work:18}{who:38}{median(self._ns[work, who]):10.1f}{said:>16}")
+            print(f"{work:18}{name:38}{median(self._ns[work, name]):10.1f}{said:>16}")
         print()
 
 
-def fill(text: str, parts: dict[str, str]) -> str:
+def fill(text: str, sections: dict[str, str]) -> str:
     """Return a page with new parts, each between <!-- begin NAME --> and <!-- end NAME
     -->.
     """
-    for name, part in parts.items():
+    for name, section in sections.items():
         begin, end = f"<!-- begin {name} -->\n", f"<!-- end {name} -->"
         before, _, rest = text.partition(begin)
         _, found, after = rest.partition(end)
         if not found:
             raise ValueError(f"a page needs a part {name}")
-        text = f"{before}{begin}{part}\n{end}{after}"
+        text = f"{before}{begin}{section}\n{end}{after}"
     return text
 
 
-def fill_page(page: Path, parts: dict[str, str], out: Path | None = None) -> None:
+def fill_page(page: Path, sections: dict[str, str], out: Path | None = None) -> None:
     """Write a page, by default in its place, with new parts; its other text stays."""
-    text = fill(page.read_text(encoding="utf-8"), parts)
+    text = fill(page.read_text(encoding="utf-8"), sections)
     (out or page).write_text(text, encoding="utf-8")

@@ -43,14 +43,14 @@ def digest(*arrays: Any) -> str:
 def simulated(name: str, method: str) -> str:
     """Simulate a shipped scene, with and without times of the samples."""
     even = np.linspace(0.0, DURATION, 26)
-    found: list[Any] = []
+    motions: list[Any] = []
     for times in (None, even):
         motion = simulate(
             name, duration=DURATION, t_eval=times, method=method, tolerance=1e-8
         )
-        found += [motion.t, motion.quaternion, motion.gamma, motion.gamma_dot]
-        found.append([motion.error_estimate, motion.status])
-    return digest(*found)
+        motions += [motion.t, motion.quaternion, motion.gamma, motion.gamma_dot]
+        motions.append([motion.error_estimate, motion.status])
+    return digest(*motions)
 
 
 def whole(name: str) -> str:
@@ -67,11 +67,11 @@ def whole(name: str) -> str:
 def stepped(name: str) -> str:
     """Go step by step with held torques."""
     run = Simulation(load_scene(name))
-    torque, found = np.array([0.3, -0.2, 0.1]), list[float]()
+    torque, hashes = np.array([0.3, -0.2, 0.1]), list[float]()
     for number in range(STEPS):
         run.step(tuple(torque * np.cos(0.3 * number)), 2_000_000)
-        found += [*run.state.quaternion, *run.state.body_rate]
-    return digest(found)
+        hashes += [*run.state.quaternion, *run.state.body_rate]
+    return digest(hashes)
 
 
 def batched() -> str:

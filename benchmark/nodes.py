@@ -59,18 +59,18 @@ class Process(subprocess.Popen[str]):
         stderr: int = subprocess.DEVNULL,
         **given: Any,
     ) -> None:
-        words = (
+        command_line = (
             [sys.executable, "-c", command] if python else [str(EXECUTABLES / command)]
         )
         options = child_process.words(given)
         if namespace:
             options += ["-r", f"__ns:={namespace}"]
         if options:
-            words += ["--ros-args", *options]
+            command_line += ["--ros-args", *options]
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
         # Nobody reads before the end, and a full pipe would stop the node.
         super().__init__(
-            words,
+            command_line,
             env={**os.environ, "PATH": path},
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -106,14 +106,14 @@ class Process(subprocess.Popen[str]):
         if self.poll() is None:
             self.send_signal(number)
         try:
-            out, _ = self.communicate(timeout=timeout)
+            output, _ = self.communicate(timeout=timeout)
         except subprocess.TimeoutExpired:
             self.kill()
-            out, _ = self.communicate()
-            return 255, out or ""
+            output, _ = self.communicate()
+            return 255, output or ""
         except ValueError:  # its output has been read and closed already
             return self.wait(), ""
-        return self.returncode, out or ""
+        return self.returncode, output or ""
 
 
 def start_simulator(namespace: str = "", **given: Any) -> Process:
@@ -212,19 +212,20 @@ class Client:
         self.wait_for(are_running, f"run of {', '.join(names)}", 240.0)
 
     def call(
-        self, kind: Any, name: str, timeout: float = 10.0, **fields: Any
+        self, service_type: Any, name: str, timeout: float = 10.0, **fields: Any
     ) -> tuple[Any, float]:
         """Call a service; return the reply, or None, and how long it took [s]."""
         if not self.knows(name):
             self._clients[name] = self.node.create_client(
-                kind, name, qos_profile=self.qos
+                service_type, name, qos_profile=self.qos
             )
         client = self._clients[name]
         if not self.until(client.service_is_ready, _DISCOVERY_S):
             return None, math.inf
-        future, began = client.call_async(kind.Request(**fields)), time.monotonic()
-        done = self.until(future.done, timeout)
-        return (future.result() if done else None), time.monotonic() - began
+        began = time.monotonic()
+        future = client.call_async(service_type.Request(**fields))
+        answered = self.until(future.done, timeout)
+        return (future.result() if answered else None), time.monotonic() - began
 
     def knows(self, service: str) -> bool:
         """Return whether a client of this service is there, from an earlier call.
@@ -245,8 +246,8 @@ class Account:
     def _ticks(self) -> dict[str, tuple[int, int]]:
         values = {name: self._watch.values[name] for name in self._nodes}
         return {
-            name: (int(one["ticks"]), int(one["ticks_missed"]))
-            for name, one in values.items()
+            name: (int(values_of_node["ticks"]), int(values_of_node["ticks_missed"]))
+            for name, values_of_node in values.items()
         }
 
     def _processor_s(self) -> float:
@@ -259,13 +260,15 @@ class Account:
 
     def missed(self) -> dict[str, float]:
         """Return the ticks missed by each, and by all under "", in percent."""
-        now, before = self._ticks(), self._before
-        found = {
-            name: [a - b for a, b in zip(now[name], before[name], strict=True)]
-            for name in now
+        ticks_now, before = self._ticks(), self._before
+        differences = {
+            name: [a - b for a, b in zip(ticks_now[name], before[name], strict=True)]
+            for name in ticks_now
         }
-        found[""] = [sum(column) for column in zip(*found.values(), strict=True)]
+        differences[""] = [
+            sum(column) for column in zip(*differences.values(), strict=True)
+        ]
         return {
             name: 100.0 * lost / max(1, kept + lost)
-            for name, (kept, lost) in found.items()
+            for name, (kept, lost) in differences.items()
         }

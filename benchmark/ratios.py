@@ -51,21 +51,21 @@ def _turns(
     return divide(time_in_turn(calls, ROUNDS, clock=clock), first, second)
 
 
-def _used_by(*words: str, starts: int = STARTS, **env: str) -> float:
+def _used_by(*arguments: str, starts: int = STARTS, **env: str) -> float:
     """Return the processor time of a program in Python [s], least of some."""
-    found = []
+    seconds = []
     for _ in range(starts):
         before = os.times()
         subprocess.run(
-            [sys.executable, *words],
+            [sys.executable, *arguments],
             check=True,
             timeout=600,
             env=os.environ | env,
             stdout=subprocess.DEVNULL,
         )
         after = os.times()
-        found.append(sum(after[2:4]) - sum(before[2:4]))
-    return min(found)
+        seconds.append(sum(after[2:4]) - sum(before[2:4]))
+    return min(seconds)
 
 
 def track_kernel_over_c() -> float:

@@ -47,23 +47,23 @@ def study_of(rows: int) -> SweepStudy:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print; the exit status is 0."""
     options = read_options("sweep", __doc__, arguments, rows=1_000_000)
-    found: dict[str, Any] = {
+    ratios: dict[str, Any] = {
         "machine": describe_machine("numpy", "llvmlite", "dask", "pyarrow")
     }
     began = time.perf_counter()
     sweep("example2_heavy", VARY, n=1000, progress=False)
-    found["seconds of the first 1,000 rows, imports and code"] = (
+    ratios["seconds of the first 1,000 rows, imports and code"] = (
         time.perf_counter() - began
     )
-    found |= _study(options.rows)
+    ratios |= _study(options.rows)
     began = time.perf_counter()
-    _arrays(PreparedSweep(study_of(100_000), found["steps"]))
-    found["seconds to prepare 1e5 rows"] = time.perf_counter() - began
-    found |= _ratios(found["steps"])
-    for name, value in found.items():
+    _arrays(PreparedSweep(study_of(100_000), ratios["steps"]))
+    ratios["seconds to prepare 1e5 rows"] = time.perf_counter() - began
+    ratios |= _ratios(ratios["steps"])
+    for name, value in ratios.items():
         if name != "machine":
             print(f"{name:>44}: {value:.6g}")
-    print(join_line(found["machine"]))
+    print(join_line(ratios["machine"]))
     return 0
 
 

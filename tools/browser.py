@@ -27,8 +27,8 @@ Without a graphics card a busy machine needs seconds to draw a frame.
 
 def chromium() -> tuple[str, str] | None:
     """Paths of an installed Chromium and its driver; None where one is missing."""
-    found = shutil.which("chromium"), shutil.which("chromedriver")
-    return (found[0], found[1]) if found[0] and found[1] else None
+    path = shutil.which("chromium"), shutil.which("chromedriver")
+    return (path[0], path[1]) if path[0] and path[1] else None
 
 
 class Browser:
@@ -79,8 +79,8 @@ class Browser:
 
     def enabled(self, label: str) -> bool:
         """Whether the button of this label is there and can be pressed."""
-        found = self._buttons(label)
-        return bool(found) and bool(found[0].is_enabled())
+        names = self._buttons(label)
+        return bool(names) and bool(names[0].is_enabled())
 
     def slide(self, label: str, keys: str) -> None:
         """Send keys to the slider of this label."""

@@ -24,21 +24,23 @@ def text(markdown: str) -> str:
     Others stay out.
     """
     title = "Changelog for package sst_ros"
-    parts = [f"{'^' * len(title)}\n{title}\n{'^' * len(title)}\n"]
-    found = _RELEASE.split(markdown)
-    for version, day, body in zip(found[1::3], found[2::3], found[3::3], strict=True):
+    sections = [f"{'^' * len(title)}\n{title}\n{'^' * len(title)}\n"]
+    releases = _RELEASE.split(markdown)
+    for version, day, body in zip(
+        releases[1::3], releases[2::3], releases[3::3], strict=True
+    ):
         head = f"{version} ({day})"
         body = re.split(r"^(?:## |\[)", body, maxsplit=1, flags=re.M)[0].strip()
-        parts.append(f"{head}\n{'-' * len(head)}\n\n{_body(body)}\n")
-    return "\n".join(parts)
+        sections.append(f"{head}\n{'-' * len(head)}\n\n{_body(body)}\n")
+    return "\n".join(sections)
 
 
 def _body(markdown: str) -> str:
     """Headings become bold paragraphs: catkin_pkg leaves nested sections out."""
-    out = re.sub(r"^### (.*)$", r"**\1**", markdown, flags=re.M)
-    out = re.sub(r"\[([^\]]+)\]\((http[^)]+)\)", r"`\1 <\2>`__", out)
+    rst = re.sub(r"^### (.*)$", r"**\1**", markdown, flags=re.M)
+    rst = re.sub(r"\[([^\]]+)\]\((http[^)]+)\)", r"`\1 <\2>`__", rst)
     return re.sub(
-        r"(?<!`)`([^`<]+)`(?!_)", lambda code: f"``{' '.join(code[1].split())}``", out
+        r"(?<!`)`([^`<]+)`(?!_)", lambda code: f"``{' '.join(code[1].split())}``", rst
     )
 
 

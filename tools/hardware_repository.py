@@ -32,11 +32,11 @@ def make(folder: Path) -> str:
     name = ET.parse(SOURCE / "package.xml").findtext("name")
     version = ET.parse(SOURCE / "package.xml").findtext("version")
 
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", folder, *words], stdout=subprocess.PIPE, check=True
+    def git(*arguments: str) -> str:
+        process = subprocess.run(
+            ["git", "-C", folder, *arguments], stdout=subprocess.PIPE, check=True
         )
-        return done.stdout.decode()
+        return process.stdout.decode()
 
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / ".git").exists():

@@ -80,7 +80,9 @@ def written() -> dict[str, str]:
 
 def placeholders() -> list[str]:
     """List the elements of package.xml that a person must still fill in."""
-    texts = [ET.tostring(one, "unicode").strip() for one in ET.fromstring(package())]
+    texts = [
+        ET.tostring(element, "unicode").strip() for element in ET.fromstring(package())
+    ]
     return [text for text in texts if PLACEHOLDER in text]
 
 

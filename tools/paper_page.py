@@ -35,7 +35,7 @@ def places() -> dict[int, str]:
 
     Comments and docstrings are read.
     """
-    found: dict[int, tuple[int, str]] = {}
+    lines: dict[int, tuple[int, str]] = {}
     for path in sorted((ROOT / "sst_ros" / "mechanism").glob("*.py")):
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)
@@ -54,9 +54,9 @@ def places() -> dict[int, str]:
                 # Among equal widths the paper's own file wins over the helpers around
                 # it.
                 rank = width if path.stem == "virtual_work" else 2 * width
-                if number not in found or rank < found[number][0]:
-                    found[number] = rank, f"`{path.stem}.{owner.name}`"
-    return {number: place for number, (_, place) in found.items()}
+                if number not in lines or rank < lines[number][0]:
+                    lines[number] = rank, f"`{path.stem}.{owner.name}`"
+    return {number: place for number, (_, place) in lines.items()}
 
 
 def page(text: str) -> str:

@@ -62,11 +62,11 @@ def platforms_of(rules: Any, platforms: dict[str, list[str]]) -> Iterator[str]:
 def table(folder: Path) -> dict[str, Any]:
     """Read what each key is from a copy of ros/rosdistro."""
 
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", folder, *words], stdout=subprocess.PIPE, check=True
+    def git(*arguments: str) -> str:
+        process = subprocess.run(
+            ["git", "-C", folder, *arguments], stdout=subprocess.PIPE, check=True
         )
-        return done.stdout.decode()
+        return process.stdout.decode()
 
     def document(path: str) -> Any:
         return yaml.load(git("show", f"HEAD:{path}"), yaml.CSafeLoader)
@@ -85,11 +85,11 @@ def table(folder: Path) -> dict[str, Any]:
             release = repository.get("release", {})
             for package in release.get("packages", [name]):
                 released[package] = release.get("version")
-        for key, known in found.items():
+        for key, released_keys in found.items():
             if released.get(key):
-                known[distribution] = released[key]
+                released_keys[distribution] = released[key]
             elif key in rules:
-                known[distribution] = [
+                released_keys[distribution] = [
                     *platforms_of(rules[key], platforms[distribution])
                 ]
     return {"commit": commit, "date": date, "platforms": platforms, "keys": found}

@@ -29,20 +29,20 @@ def format_ledgers(ledgers: list[Ledger]) -> str:
     """Return the table of all parts, Markdown."""
     rows = [
         {
-            "what was tried": one.what,
-            "cases": one.tried,
-            **{name: getattr(one, kind) for kind, name in KINDS.items()},
-            "longest [s]": f"{one.longest_s:.2f}",
+            "what was tried": ledger.what,
+            "cases": ledger.tried,
+            **{name: getattr(ledger, attribute) for attribute, name in KINDS.items()},
+            "longest [s]": f"{ledger.longest_s:.2f}",
         }
-        for one in ledgers
+        for ledger in ledgers
     ]
     return markdown(data_frame(rows))
 
 
-def run_apart(part: str, share: float, seed: int, patience: float) -> Ledger:
+def run_apart(part_name: str, share: float, seed: int, patience: float) -> Ledger:
     """Run a part in a new process: what it leaves in memory is no other's."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        return process.submit(run_part, part, share, seed, patience).result()
+        return process.submit(run_part, part_name, share, seed, patience).result()
 
 
 def main() -> int:
@@ -64,28 +64,34 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=2, help="parts at once")
     parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
     options = parser.parse_args()
-    parts = options.only or list(PARTS)
+    part_names = options.only or list(PARTS)
     began = time.monotonic()
-    found: dict[str, Ledger] = {}
+    ledger_of_part: dict[str, Ledger] = {}
     with ThreadPoolExecutor(options.processes) as pool:
         # The longest first: `bits` compiles 200 scenes, then the nodes.
         long_first = sorted(
-            parts, key=lambda part: (part != "bits", PARTS[part][0] != "nodes")
+            part_names,
+            key=lambda part_name: (part_name != "bits", PARTS[part_name][0] != "nodes"),
         )
         waiting = {
             pool.submit(
-                run_apart, part, options.share, options.seed, options.patience
-            ): part
-            for part in long_first
+                run_apart, part_name, options.share, options.seed, options.patience
+            ): part_name
+            for part_name in long_first
         }
         for future in as_completed(waiting):
-            part = waiting[future]
-            found[part] = ledger = future.result()
+            part_name = waiting[future]
+            ledger_of_part[part_name] = ledger = future.result()
             mark = "ok" if ledger.sound else "FOUND"
-            said = f"{part}: {mark}, {ledger.tried} cases, {ledger.seconds:.0f} s"
+            summary = (
+                f"{part_name}: {mark}, {ledger.tried} cases, {ledger.seconds:.0f} s"
+            )
             notes = "".join(f"\n    {note}" for note in ledger.notes[:20])
-            print(f"[{len(found)}/{len(parts)}] {said}{notes}", flush=True)
-    ledgers = [found[part] for part in parts]
+            print(
+                f"[{len(ledger_of_part)}/{len(part_names)}] {summary}{notes}",
+                flush=True,
+            )
+    ledgers = [ledger_of_part[part_name] for part_name in part_names]
     text = format_ledgers(ledgers)
     minutes = (time.monotonic() - began) / 60
     print(
@@ -93,13 +99,13 @@ def main() -> int:
         " minutes"
     )
     if options.write:
-        made = (
+        provenance = (
             f"Seed {options.seed}, share {options.share:g} of all cases, {minutes:.0f}"
             f" minutes, bounds of time times {options.patience:g}, load"
             f" {os.getloadavg()[0]:.0f} at the end, {platform.machine()}, Python"
             f" {platform.python_version()}, {date.today()}."
         )
-        fill_page(PAGE, {"results": f"{text}\n\n{made}"})
+        fill_page(PAGE, {"results": f"{text}\n\n{provenance}"})
     return 0 if all(ledger.sound for ledger in ledgers) else 1
 
 

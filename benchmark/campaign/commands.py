@@ -26,7 +26,7 @@ A command that does its work takes longer beside other work.
 
 def sst_ros(
     ledger: Ledger,
-    words: Sequence[str],
+    arguments: Sequence[str],
     *,
     folder: Path,
     env: Mapping[str, str] | None = None,
@@ -39,10 +39,10 @@ def sst_ros(
     Count a hang, a traceback, a long message or a wrong exit status.
     """
     ledger.tried += 1
-    name, began = " ".join(words)[:120], time.perf_counter()
+    name, began = " ".join(arguments)[:120], time.perf_counter()
     try:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sst_ros", *words],
+            [sys.executable, "-m", "sst_ros", *arguments],
             cwd=folder,
             env={**os.environ, **(env or {})},
             stdout=subprocess.PIPE,
@@ -52,9 +52,9 @@ def sst_ros(
             user=user,
             stdin=subprocess.DEVNULL,
         )
-        _, said = communicate(process, bound * ledger.patience)
+        _, error_text = communicate(process, bound * ledger.patience)
     except subprocess.TimeoutExpired:
-        ledger.found("hangs", f"{name}: no end within its bound")
+        ledger.add_finding("hangs", f"{name}: no end within its bound")
         return
     except (ValueError, OSError) as error:  # words that no process can be given
         ledger.tried -= 1
@@ -62,12 +62,14 @@ def sst_ros(
         return
     ledger.time(time.perf_counter() - began, math.inf, name)
     status = process.returncode
-    if "Traceback (most recent call last)" in said:
-        ledger.found("tracebacks", f"{name}: {said.strip().splitlines()[-1]}")
+    if "Traceback (most recent call last)" in error_text:
+        ledger.add_finding(
+            "tracebacks", f"{name}: {error_text.strip().splitlines()[-1]}"
+        )
     elif fails is not None and fails == (status == 0):
-        ledger.found("silent", f"{name}: exit status {status}")
+        ledger.add_finding("silent", f"{name}: exit status {status}")
     elif status < 0:
-        ledger.found("tracebacks", f"{name}: ended by signal {-status}")
+        ledger.add_finding("tracebacks", f"{name}: ended by signal {-status}")
 
 
 VERBS = "compile demo describe export plan plot report recover scene study view".split()  # noqa: SIM905
@@ -125,10 +127,10 @@ def command_lines(ledger: Ledger) -> None:
         (folder / "empty.yaml").write_text("")
         (folder / "binary.yaml").write_bytes(os.urandom(300))
         count = len(ledger.numbers(150, least=4))
-        for words in (
+        for arguments in (
             WRONG if ledger.share >= 1 else rng.sample(WRONG, min(len(WRONG), count))
         ):
-            sst_ros(ledger, words, folder=folder, fails=True)
+            sst_ros(ledger, arguments, folder=folder, fails=True)
         words_of = [
             "",
             "-",
@@ -152,12 +154,12 @@ def command_lines(ledger: Ledger) -> None:
         ]
         for _ in range(count - ledger.tried):
             verb = rng.choice(VERBS)
-            words = [
+            arguments = [
                 verb,
                 "--nosuchoption",
                 *rng.choices(words_of, k=rng.randint(0, 3)),
             ]
-            sst_ros(ledger, words, folder=folder, fails=True)
+            sst_ros(ledger, arguments, folder=folder, fails=True)
 
 
 def surroundings(ledger: Ledger) -> None:
@@ -192,10 +194,15 @@ def surroundings(ledger: Ledger) -> None:
         labels = [*cases]
         ledger.rng.shuffle(labels)
         for label in labels[: len(ledger.numbers(len(cases), least=4))]:
-            words, env, user = cases[label]
+            command_line, env, user = cases[label]
             before = len(ledger.notes)
             sst_ros(
-                ledger, words.split(), folder=folder, env=env, user=user, bound=60.0
+                ledger,
+                command_line.split(),
+                folder=folder,
+                env=env,
+                user=user,
+                bound=60.0,
             )
             ledger.notes[before:] = [
                 f"{label}: {note}" for note in ledger.notes[before:]
@@ -209,9 +216,9 @@ def surroundings(ledger: Ledger) -> None:
                     "stderr": subprocess.PIPE,
                     "text": True,
                 }
-                done = subprocess.run(
+                process = subprocess.run(
                     command, cwd=folder, timeout=60.0 * ledger.patience, **pipes
                 )
-            if "Traceback" in done.stderr:
-                note = f"{' '.join(verb)} into a full disk: {done.stderr[-200:]}"
-                ledger.found("tracebacks", note)
+            if "Traceback" in process.stderr:
+                note = f"{' '.join(verb)} into a full disk: {process.stderr[-200:]}"
+                ledger.add_finding("tracebacks", note)

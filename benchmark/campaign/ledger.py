@@ -66,21 +66,21 @@ class Ledger:
             self.tried += 1
             yield number
 
-    def found(self, kind: str, note: str, count: int = 1) -> None:
+    def add_finding(self, column: str, note: str, count: int = 1) -> None:
         """Count a finding of one of KINDS."""
-        setattr(self, kind, getattr(self, kind) + count)
-        self.notes.append(f"{kind}: {note}"[:400])
+        setattr(self, column, getattr(self, column) + count)
+        self.notes.append(f"{column}: {note}"[:400])
 
-    def time(self, took: float, bound: float, what: str) -> None:
+    def time(self, took: float, bound: float, case_name: str) -> None:
         """Keep how long something took [s]; beyond its bound it is a hang."""
         self.longest_s = max(self.longest_s, took if math.isfinite(took) else 0.0)
         if took > bound * self.patience:
-            self.found("hangs", f"{what}: {took:.2f} s")
+            self.add_finding("hangs", f"{case_name}: {took:.2f} s")
 
     @property
     def sound(self) -> bool:
         """Whether nothing was found."""
-        return not any(getattr(self, kind) for kind in KINDS)
+        return not any(getattr(self, column) for column in KINDS)
 
     @contextlib.contextmanager
     def case(self, name: str, bound: float) -> Iterator[None]:
@@ -96,7 +96,7 @@ class Ledger:
         except SstError:
             pass
         except Exception as error:
-            self.found("tracebacks", f"{name}: {type(error).__name__}: {error}")
+            self.add_finding("tracebacks", f"{name}: {type(error).__name__}: {error}")
         self.time(time.process_time() - began, bound, name)
 
 
@@ -126,14 +126,15 @@ PARTS = {
 """Module of each part, a function of a ledger, and what it tries."""
 
 
-def run_part(part: str, share: float, seed: int, patience: float = 1.0) -> Ledger:
+def run_part(part_name: str, share: float, seed: int, patience: float = 1.0) -> Ledger:
     """Run one part in this process."""
-    room, what = PARTS[part]
-    ledger, began = Ledger(what, share, seed, patience), time.monotonic()
+    room, description = PARTS[part_name]
+    ledger, began = Ledger(description, share, seed, patience), time.monotonic()
     try:
-        getattr(importlib.import_module(f"benchmark.campaign.{room}"), part)(ledger)
+        module = importlib.import_module(f"benchmark.campaign.{room}")
+        getattr(module, part_name)(ledger)
     except Exception as error:
-        ledger.found(
+        ledger.add_finding(
             "tracebacks", f"the part itself ended: {type(error).__name__}: {error}"
         )
     ledger.seconds = time.monotonic() - began

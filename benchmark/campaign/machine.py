@@ -40,7 +40,7 @@ def run(number: int) -> bytes:
     scene, method = RUNS[number % len(RUNS)]
     motion = simulate(scene, duration=0.05 + 0.01 * (number % 3), method=method)
     return b"".join(
-        one.to_pandas().to_numpy().tobytes() for one in (motion, motion.at([0.02]))
+        table.to_pandas().to_numpy().tobytes() for table in (motion, motion.at([0.02]))
     )
 
 
@@ -51,16 +51,20 @@ def workers(ledger: Ledger) -> None:
         partial(ThreadPoolExecutor, n) for n in (2, 8)
     ]
     contexts = [get_context(name) for name in ("fork", "spawn")]
-    makers += [partial(ProcessPoolExecutor, 2, mp_context=one) for one in contexts]
+    makers += [
+        partial(ProcessPoolExecutor, 2, mp_context=run_number)
+        for run_number in contexts
+    ]
     for number in ledger.numbers(24):
         numbers = ledger.rng.sample(range(12), 8)
         with ledger.case(f"workers {number}", bound=60.0):
             with makers[number % len(makers)]() as pool:
-                found = list(pool.map(run, numbers, timeout=300.0 * ledger.patience))
-            for one, bits in zip(numbers, found, strict=True):
-                if bits != alone[one]:
-                    ledger.found(
-                        "silent", f"workers {number}: {RUNS[one % 4]} has other bits"
+                run_bits = list(pool.map(run, numbers, timeout=300.0 * ledger.patience))
+            for run_number, bits in zip(numbers, run_bits, strict=True):
+                if bits != alone[run_number]:
+                    ledger.add_finding(
+                        "silent",
+                        f"workers {number}: {RUNS[run_number % 4]} has other bits",
                     )
 
 
@@ -78,11 +82,11 @@ def saves(ledger: Ledger) -> None:
             path = Path(name) / f"motion{suffix}"
             with ledger.case(f"saves {number}", bound=20.0):
                 list(pool.map(partial(_save, path), (0.1, 0.2, 0.3, 0.4)))
-                found = Trajectory.load(path)
-                whole = simulate("example2", duration=float(found.t[-1]))
+                motion = Trajectory.load(path)
+                expected = simulate("example2", duration=float(motion.t[-1]))
                 left = [*Path(name).iterdir()]
-                if not np.array_equal(found.gamma, whole.gamma) or left != [path]:
-                    ledger.found(
+                if not np.array_equal(motion.gamma, expected.gamma) or left != [path]:
+                    ledger.add_finding(
                         "silent", f"saves {number}: {path.name} is of several motions"
                     )
 
@@ -90,11 +94,11 @@ def saves(ledger: Ledger) -> None:
 def _flip(path: Path, rng: random.Random) -> None:
     """Flip a bit of a file, or cut it."""
     content = bytearray(path.read_bytes())
-    at = rng.randrange(len(content))
+    position = rng.randrange(len(content))
     if rng.random() < 0.2:
-        del content[at:]
+        del content[position:]
     else:
-        content[at] ^= 1 << rng.randrange(8)
+        content[position] ^= 1 << rng.randrange(8)
     path.write_bytes(content)
 
 
@@ -131,12 +135,12 @@ def damage(ledger: Ledger) -> None:
                 if chosen is not bag:
                     Trajectory.load(target)
                 else:
-                    found = recording.read(target)
+                    damaged = recording.read(target)
                     same = np.array_equal(
-                        found.trajectory.gamma, expected.trajectory.gamma
+                        damaged.trajectory.gamma, expected.trajectory.gamma
                     )
-                    if not same and not found.signals.bag.damage:
-                        ledger.found(
+                    if not same and not damaged.signals.bag.damage:
+                        ledger.add_finding(
                             "silent",
                             f"damage {number}: {inside.name} differs in silence",
                         )
@@ -163,29 +167,36 @@ def interrupts(ledger: Ledger) -> None:
     rng = ledger.rng
     with TemporaryDirectory() as name:
         for number in ledger.cases(300, least=6):
-            words = [sys.executable, "-m", "sst_ros", *rng.choice(COMMANDS).split()]
+            command = [sys.executable, "-m", "sst_ros", *rng.choice(COMMANDS).split()]
             if closed := rng.choice([(), (0,), (1,), (2,), (0, 1, 2)]):
-                shut = " ".join(f"{one}>&-" for one in closed).replace("0>", "0<")
-                words = ["sh", "-c", f'exec "$@" {shut}', "sh", *words]
+                shut = " ".join(f"{descriptor}>&-" for descriptor in closed).replace(
+                    "0>", "0<"
+                )
+                command = ["sh", "-c", f'exec "$@" {shut}', "sh", *command]
             pipes: dict[str, Any] = {
                 "stdout": subprocess.PIPE,
                 "stderr": subprocess.PIPE,
             }
-            process = subprocess.Popen(words, cwd=name, text=True, **pipes)
+            process = subprocess.Popen(command, cwd=name, text=True, **pipes)
             sent = rng.choice((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, None))
             if sent is not None:
                 # The wait is the experiment: the moment of the signal is random.
                 time.sleep(rng.uniform(0.0, 1.5))
                 process.send_signal(sent)
-            label = f"{number}: {words[-3:]}, signal {sent}, closed {closed}"
+            label = f"{number}: {command[-3:]}, signal {sent}, closed {closed}"
             began = time.monotonic()
             try:
-                _, said = communicate(process, 60.0 * ledger.patience)
+                _, error_text = communicate(process, 60.0 * ledger.patience)
             except subprocess.TimeoutExpired:
-                ledger.found("hangs", label)
+                ledger.add_finding("hangs", label)
                 continue
             ledger.time(time.monotonic() - began, math.inf, label)
             # Not by the names of functions: Python's `site` has a `main`, too.
-            early = said.rstrip().endswith("KeyboardInterrupt") and PACKAGE not in said
-            if "Traceback" in said and not early:
-                ledger.found("tracebacks", f"{label}: {said.strip().splitlines()[-1]}")
+            early = (
+                error_text.rstrip().endswith("KeyboardInterrupt")
+                and PACKAGE not in error_text
+            )
+            if "Traceback" in error_text and not early:
+                ledger.add_finding(
+                    "tracebacks", f"{label}: {error_text.strip().splitlines()[-1]}"
+                )

@@ -46,16 +46,16 @@ however busy the machine is.
 NODE = "/sst_simulator"
 
 
-def start(command: str, **given: Any) -> Process:
+def start(command: str, **values: Any) -> Process:
     """Start a plain node, with parameters."""
-    return Process(command, stderr=subprocess.STDOUT, **given)
+    return Process(command, stderr=subprocess.STDOUT, **values)
 
 
 @contextmanager
-def running(**given: object) -> Iterator[tuple[Process, Client]]:
+def running(**values: object) -> Iterator[tuple[Process, Client]]:
     """Give a running simulator and a client of it."""
     with own_domain() as number:
-        process = start("simulator", **{"scene": "swing", "duration": 0.0, **given})
+        process = start("simulator", **{"scene": "swing", "duration": 0.0, **values})
         client = Client(number)
         try:
             yield process, client
@@ -69,8 +69,8 @@ def is_alive(ledger: Ledger, process: Process, client: Client, after: str) -> bo
     from std_srvs.srv import SetBool
 
     if process.poll() is not None:
-        said = process.end(0, 20.0)[1][-300:]
-        ledger.found("tracebacks", f"the node ended after {after}: {said}")
+        output = process.end(0, 20.0)[1][-300:]
+        ledger.add_finding("tracebacks", f"the node ended after {after}: {output}")
         return False
     ask(ledger, process, client, SetBool, "pause", after, data=False)
     return True
@@ -80,7 +80,7 @@ def ask(
     ledger: Ledger,
     process: Process,
     client: Client,
-    kind: Any,
+    service_type: Any,
     name: str,
     after: str,
     **fields: Any,
@@ -91,7 +91,7 @@ def ask(
         ledger: of the part.
         process: the node.
         client: who calls.
-        kind: of the service.
+        service_type: of the service.
         name: of the service below that of the node.
         after: what the node has gone through.
         fields: of the request.
@@ -99,9 +99,9 @@ def ask(
     """
     is_first = not client.knows(f"{NODE}/{name}")
     own_time = OwnTime(process.pid, os.getpid())
-    reply, _ = client.call(kind, f"{NODE}/{name}", LOST_S, **fields)
+    reply, _ = client.call(service_type, f"{NODE}/{name}", LOST_S, **fields)
     if reply is None:
-        ledger.found("lost", f"no reply of {name} after {after}")
+        ledger.add_finding("lost", f"no reply of {name} after {after}")
     else:
         bound_s = FIRST_REPLY_S if is_first else REPLY_S
         ledger.time(own_time.seconds(), bound_s, f"a reply of {name} after {after}")
@@ -120,9 +120,9 @@ def stop(
     ledger.time(wait_for_end(process, HUNG_S), CLOSE_S, "the end")
     status, text = process.end(signal.SIGKILL)
     if status not in statuses:
-        ledger.found("tracebacks", f"exit status {status}: {text[-300:]}")
+        ledger.add_finding("tracebacks", f"exit status {status}: {text[-300:]}")
     elif "Traceback" in text:
-        ledger.found("tracebacks", text[-300:])
+        ledger.add_finding("tracebacks", text[-300:])
 
 
 def messages(ledger: Ledger) -> None:
@@ -155,13 +155,13 @@ def messages(ledger: Ledger) -> None:
             lambda: plain.get_subscription_count() and stamped.get_subscription_count()
         )
         for number in ledger.cases(1200, least=60):
-            kind = rng.randrange(3)
+            message_type = rng.randrange(3)
             data = [
                 rng.choice(odd) for _ in range(rng.choice((0, 1, 3, 3, 3, 9, 2000)))
             ]
-            if kind == 0:
+            if message_type == 0:
                 plain.publish(Float64MultiArray(data=data))
-            elif kind == 1:
+            elif message_type == 1:
                 chosen = [
                     rng.choice(names) for _ in range(rng.choice((len(data), 3, 0)))
                 ]
@@ -179,7 +179,7 @@ def messages(ledger: Ledger) -> None:
                 return
         is_alive(ledger, process, client, "all messages")
         if bad:
-            ledger.found("silent", f"a state is not finite: {bad[0]}", len(bad))
+            ledger.add_finding("silent", f"a state is not finite: {bad[0]}", len(bad))
         stop(ledger, process)
 
 
@@ -246,16 +246,16 @@ def node_kills(ledger: Ledger) -> None:
         ):
             table = Path(folder) / "torques.csv"
             table.write_text("time,tau_1,tau_2,tau_3\n0,0.01,0,0\n60,0,0,0\n")
-            kind = ("torque_player", "inverse_dynamics")[number % 2]
-            other = start(
-                kind, **({"scene": "reach"} if number % 2 else {"csv": table})
+            command = ("torque_player", "inverse_dynamics")[number % 2]
+            victim = start(
+                command, **({"scene": "reach"} if number % 2 else {"csv": table})
             )
             client.until(lambda: client.node.count_subscribers("/joint_states"))
             # The wait is the experiment: the moment of the kill is random.
             time.sleep(rng.uniform(0.0, 1.5))
-            other.kill()
-            other.communicate()
-            is_alive(ledger, process, client, f"the kill of {kind}")
+            victim.kill()
+            victim.communicate()
+            is_alive(ledger, process, client, f"the kill of {command}")
             stop(ledger, process, rng.choice((signal.SIGINT, signal.SIGTERM)))
 
 
@@ -277,7 +277,7 @@ def recorder_kills(ledger: Ledger) -> None:
                     time.sleep(0.01)
                 if (size := _size(bag)) < 50_000:
                     states = f"simulator {simulator.poll()}, recorder {recorder.poll()}"
-                    ledger.found(
+                    ledger.add_finding(
                         "hangs", f"kill {number}: {size} bytes in time, ends: {states}"
                     )
                     continue
@@ -291,9 +291,9 @@ def recorder_kills(ledger: Ledger) -> None:
                     note = (
                         f"kill {number}: gaps inside what was recovered, {size} bytes"
                     )
-                    ledger.found("lost", note)
+                    ledger.add_finding("lost", note)
             except SstError as error:
-                ledger.found("lost", f"kill {number}: {error}")
+                ledger.add_finding("lost", f"kill {number}: {error}")
             finally:
                 for process in (simulator, recorder):
                     process.end(signal.SIGKILL, 20.0)
@@ -329,16 +329,16 @@ def _time_fault(ledger: Ledger, process: Process, client: Client) -> None:
     commands = client.node.create_publisher(Float64MultiArray, f"{NODE}/commands", 10)
     ready = lambda: phases and commands.get_subscription_count()  # noqa: E731
     if not client.until(ready, LOST_S):
-        ledger.found("lost", "no phase, or no subscription of commands")
+        ledger.add_finding("lost", "no phase, or no subscription of commands")
         return
     commands.publish(Float64MultiArray(data=[0.01, 0.0, 0.0]))
     # The command waits until the code of the scene is loaded.
     if not client.until(lambda: "running" in phases, LOST_S):
-        ledger.found("lost", f"no run, the phases are {phases}")
+        ledger.add_finding("lost", f"no run, the phases are {phases}")
         return
     own_time = OwnTime(process.pid, os.getpid())
     if not client.until(lambda: phases[-1].startswith("fault"), LOST_S):
-        ledger.found("lost", f"no fault, the phases are {phases}")
+        ledger.add_finding("lost", f"no fault, the phases are {phases}")
         return
     ledger.time(own_time.seconds(), FAULT_S, "the fault")
     ask(ledger, process, client, SetBool, "pause", "the fault", data=True)
@@ -353,11 +353,11 @@ def starts(ledger: Ledger) -> None:
     before = _shared_memory()
     for number in ledger.cases(200, least=4):
         with own_domain():
-            kind = ("simulator", "torque_player", "recorder", "inverse_dynamics")[
+            command = ("simulator", "torque_player", "recorder", "inverse_dynamics")[
                 number % 4
             ]
             bag = {"output": f"/tmp/sst_campaign_{os.getpid()}_{number}"}
-            process = start(kind, **(bag if kind == "recorder" else {}))
+            process = start(command, **(bag if command == "recorder" else {}))
             # The wait is the experiment: the moment of the signal is random.
             time.sleep(rng.uniform(0.0, 2.0))
             number_sent = rng.choice((signal.SIGINT, signal.SIGTERM))
@@ -365,7 +365,7 @@ def starts(ledger: Ledger) -> None:
             stop(ledger, process, number_sent, (0, 1, -signal.SIGTERM))
     left = _shared_memory() - before
     if len(left) > 4:
-        ledger.found(
+        ledger.add_finding(
             "lost", f"{len(left)} files left in /dev/shm: {sorted(left)[:3]}", len(left)
         )
 
@@ -393,12 +393,12 @@ def message_orders(ledger: Ledger) -> None:
         rclpy.init(args=["--ros-args", "--log-level", "fatal"])
         try:
             for number in ledger.cases(600, least=20):
-                kind = (TorquePlayer, InverseDynamicsController)[number % 2]
+                worker_type = (TorquePlayer, InverseDynamicsController)[number % 2]
                 last = rng.choice((FAULT, "finished"))
                 phases = [String(data=name) for name in ("waiting", "running", last)]
                 states = _states(rng, count=4 if last == FAULT else 3)
                 merged = _merge(rng, phases[rng.randrange(3) :], states)
-                worker: Any = kind()
+                worker: Any = worker_type()
                 worker._commands = Commands()
                 _hear(ledger, worker, merged, last)
                 if isinstance(worker, InverseDynamicsController):
@@ -446,9 +446,12 @@ def _states(rng: random.Random, count: int) -> list[Any]:
 def _merge(rng: random.Random, first: list[Any], second: list[Any]) -> list[Any]:
     """Return the messages of two topics in a random order that keeps each one's."""
     places = set(rng.sample(range(len(first) + len(second)), len(first)))
-    one, other = iter(first), iter(second)
+    first_messages, second_messages = iter(first), iter(second)
     count = len(first) + len(second)
-    return [next(one) if place in places else next(other) for place in range(count)]
+    return [
+        next(first_messages) if place in places else next(second_messages)
+        for place in range(count)
+    ]
 
 
 def _hear(ledger: Ledger, worker: Any, messages: list[Any], last: str) -> None:
@@ -466,9 +469,9 @@ def _hear(ledger: Ledger, worker: Any, messages: list[Any], last: str) -> None:
     except SstError as error:
         heard = last == FAULT
         if not heard:
-            ledger.found("tracebacks", f"{name} after {order}: {error}")
+            ledger.add_finding("tracebacks", f"{name} after {order}: {error}")
     except Exception as error:
         text = f"{name} after {order}: {type(error).__name__}: {error}"
-        ledger.found("tracebacks", text)
+        ledger.add_finding("tracebacks", text)
     if not heard and worker.commanded:
-        ledger.found("lost", f"{name} does not hear {last!r} after {order}")
+        ledger.add_finding("lost", f"{name} does not hear {last!r} after {order}")

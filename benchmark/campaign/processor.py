@@ -37,10 +37,10 @@ class OwnTime:
         for pid in self._pids:
             for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
                 try:
-                    words = path.read_text(encoding="ascii").split()
+                    account = path.read_text(encoding="ascii").split()
                 except OSError:  # the thread has ended
                     continue
-                waits[str(path.parent)] = int(words[1])
+                waits[str(path.parent)] = int(account[1])
         return waits
 
     def seconds(self) -> float:

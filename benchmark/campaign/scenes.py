@@ -43,7 +43,7 @@ def _finite(ledger: Ledger, name: str, state: Any) -> None:
         *state.joints.gamma_dot,
     )
     if not all(map(math.isfinite, numbers)):
-        ledger.found("silent", f"{name}: a number is not finite")
+        ledger.add_finding("silent", f"{name}: a number is not finite")
 
 
 def random_scene(rng: random.Random) -> Scene:
@@ -72,14 +72,14 @@ def random_scene(rng: random.Random) -> Scene:
             "centre": [0, 0, rng.uniform(0, 0.3)],
         }
     if rng.random() < 0.5:
-        kind = rng.choice(("gamma", "mu", "beta"))
+        joint_kind = rng.choice(("gamma", "mu", "beta"))
         rubbing = {"viscous": rng.uniform(0, 1), "coulomb": rng.uniform(0, 0.5)}
         if rng.random() < 0.5:  # Stribeck
             rubbing |= {
                 "static": 2.0 * rubbing["coulomb"],
                 "stribeck": 10 ** rng.uniform(-2, 0),
             }
-        tree["friction"] = {kind: rubbing}
+        tree["friction"] = {joint_kind: rubbing}
     if rng.random() < 0.4:
         joint = f"{rng.choice(('gamma', 'mu', 'beta'))}_{rng.randint(1, 3)}"
         tree["springs"] = [
@@ -110,10 +110,12 @@ def invariants(ledger: Ledger) -> None:
                 _finite(ledger, name, plain.step(torque, PERIOD_NS))
                 fine.step(torque, PERIOD_NS)
             if not plain.closure_residual < 1e-14:
-                ledger.found("silent", f"{name}: closure {plain.closure_residual:.1e}")
+                ledger.add_finding(
+                    "silent", f"{name}: closure {plain.closure_residual:.1e}"
+                )
             energy = sum(abs(x) for x in fine.state.body_rate) ** 2
             if not abs(plain.energy_residual) < 1e-7 * (1 + energy):
-                ledger.found(
+                ledger.add_finding(
                     "silent", f"{name}: energy residual {plain.energy_residual:.1e} J"
                 )
             error = float(angle_between(plain.state.quaternion, fine.state.quaternion))
@@ -122,18 +124,18 @@ def invariants(ledger: Ledger) -> None:
                 and error > 3 * plain.error_estimate + 3 * fine.error_estimate
             ):
                 note = f"{name}: error {error:.1e}, estimate {plain.error_estimate:.1e}"
-                ledger.found("silent", note)
+                ledger.add_finding("silent", note)
 
 
 def _draw_torque(rng: random.Random) -> Torque:
     """Three numbers, or a function of time that jumps, or has a pulse."""
-    one, other = ([rng.uniform(-2, 2) for _ in range(3)] for _ in range(2))
+    torque, later_torque = ([rng.uniform(-2, 2) for _ in range(3)] for _ in range(2))
     begin, end = sorted(rng.uniform(0, 0.1) for _ in range(2))
     functions = (
-        lambda t: one if t < begin else other,
-        lambda t: one if begin < t < end else other,
+        lambda t: torque if t < begin else later_torque,
+        lambda t: torque if begin < t < end else later_torque,
     )
-    return rng.choice((tuple(one), *functions))
+    return rng.choice((tuple(torque), *functions))
 
 
 def estimates(ledger: Ledger) -> None:
@@ -152,7 +154,7 @@ def estimates(ledger: Ledger) -> None:
                     note = (
                         f"{name} {number}: error {error:.1e}, estimate {estimate:.1e}"
                     )
-                    ledger.found("silent", note)
+                    ledger.add_finding("silent", note)
 
 
 def bits(ledger: Ledger) -> None:
@@ -178,7 +180,7 @@ def bits(ledger: Ledger) -> None:
                 plain_states = [run.step(torque, PERIOD_NS) for _ in range(40)]
             for plain, fast in zip(plain_states, fast_states, strict=True):
                 if plain != fast:
-                    ledger.found(
+                    ledger.add_finding(
                         "silent", f"{name} {method}: bits differ at {plain.time_ns} ns"
                     )
                     break

@@ -56,17 +56,19 @@ def cold_threads(ledger: Ledger) -> None:
             text=True,
         )
         try:
-            out, said = communicate(process, COLD_S * ledger.patience)
+            output, error_text = communicate(process, COLD_S * ledger.patience)
         except subprocess.TimeoutExpired:
-            ledger.found("hangs", f"cold process of {name}")
+            ledger.add_finding("hangs", f"cold process of {name}")
             continue
         ledger.time(time.monotonic() - began, math.inf, name)
         alone = simulate(name, duration=0.05).quaternion[-1].tobytes().hex()
         if process.returncode:
-            error = said.strip().splitlines()[-1:]
-            ledger.found("tracebacks", f"cold process of {name}: {error}")
-        elif out.split() != [alone]:
-            ledger.found("silent", f"threads of a cold process of {name}: other bits")
+            error = error_text.strip().splitlines()[-1:]
+            ledger.add_finding("tracebacks", f"cold process of {name}: {error}")
+        elif output.split() != [alone]:
+            ledger.add_finding(
+                "silent", f"threads of a cold process of {name}: other bits"
+            )
 
 
 class OwnError(Exception):
@@ -95,41 +97,41 @@ def user_functions(ledger: Ledger) -> None:
     """Raise in a torque of the user, early and late: that exception comes out."""
     rng = ledger.rng
     for _ in ledger.cases(400, least=20):
-        kind = rng.choice(EXCEPTIONS)
+        error_type = rng.choice(EXCEPTIONS)
         late = rng.choice((0.0, rng.uniform(0.0, 0.05)))
         method = rng.choice(METHODS)
-        way = rng.choice(("function of time", "feedback", "held", "step"))
-        name = f"{kind.__name__} in a {way} with {method} from {late:.3f} s on"
+        call = rng.choice(("function of time", "feedback", "held", "step"))
+        name = f"{error_type.__name__} in a {call} with {method} from {late:.3f} s on"
         began = time.process_time()
         try:
-            _call_user_function(way, kind, late, method)
-        except kind as error:
+            _call_user_function(call, error_type, late, method)
+        except error_type as error:
             if error.args != ("of the user",):
-                ledger.found("silent", f"{name}: other arguments {error.args}")
+                ledger.add_finding("silent", f"{name}: other arguments {error.args}")
         except BaseException as error:
-            ledger.found("tracebacks", f"{name}: {type(error).__name__}: {error}")
+            ledger.add_finding("tracebacks", f"{name}: {type(error).__name__}: {error}")
         else:
-            ledger.found("silent", f"{name}: nothing came out")
+            ledger.add_finding("silent", f"{name}: nothing came out")
         ledger.time(time.process_time() - began, 10.0, name)
 
 
 def _call_user_function(
-    way: str, kind: type[BaseException], late: float, method: str
+    call: str, error_type: type[BaseException], late: float, method: str
 ) -> None:
     """Simulate 0.1 s with a torque that raises from a time [s] on."""
 
     def torque(t: float, _: object = None) -> tuple[float, float, float]:
         if t >= late:
-            raise kind("of the user")
+            raise error_type("of the user")
         return 0.1, -0.1, 0.05
 
-    if way == "step":
+    if call == "step":
         run = Simulation("swing", method)
         for _ in range(100):
             run.step(lambda t: torque(t), 1_000_000)
-    elif way == "feedback":
+    elif call == "feedback":
         simulate("swing", lambda t, state: torque(t, state), 0.1, method=method)
-    elif way == "held":
+    elif call == "held":
         simulate(
             "swing",
             lambda t, state: torque(t, state),
@@ -156,14 +158,14 @@ def foreign_files(ledger: Ledger) -> None:
             f"{0.01 * k:g},{0.1 * k:g},0,-{k:g}\n" for k in range(30)
         )
         study = "scene: swing\nn: 4\nvary:\n  star.mass: {uniform: [1.5, 2.5]}\n"
-        kinds: tuple[tuple[str, str, Callable[[Path], Any]], ...] = (
+        readers: tuple[tuple[str, str, Callable[[Path], Any]], ...] = (
             ("scene.yaml", text_of("swing")[0], load_scene),
             ("study.yaml", study, SweepStudy.read),
             ("torques.csv", table, TorqueTable.read),
             ("motion.csv", motion.read_text(encoding="utf-8"), Trajectory.load),
         )
         for number in ledger.numbers(1200, least=40):
-            file, text, read = rng.choice(kinds)
+            file, text, read = rng.choice(readers)
             path = folder / f"{number}_{file}"
             how = _write_foreign(rng, path, text)
             with ledger.case(f"{file}, {how}", bound=FILE_S):
@@ -228,9 +230,9 @@ def _write_foreign(rng: random.Random, path: Path, text: str) -> str:
     elif how == "insert":
         lines.insert(place, rng.choice(NASTY) + "\n")
     else:
-        words = lines[place].split(" ")
-        words[rng.randrange(len(words))] = rng.choice(NASTY)
-        lines[place] = " ".join(words).rstrip("\n") + "\n"
+        fields = lines[place].split(" ")
+        fields[rng.randrange(len(fields))] = rng.choice(NASTY)
+        lines[place] = " ".join(fields).rstrip("\n") + "\n"
     path.write_text("".join(lines), encoding="utf-8", errors="surrogatepass")
     return f"{how} at line {place + 1}"
 
@@ -242,46 +244,48 @@ def _check_finite(ledger: Ledger, name: str, result: Any) -> None:
         numbers = [result.times, result.torques]
     elif isinstance(result, Trajectory):
         numbers = [result.t, result.quaternion, result.body_rate]
-    if not all(bool(np.isfinite(one).all()) for one in numbers):
-        ledger.found("silent", f"{name}: numbers that are not finite were read")
+    if not all(bool(np.isfinite(array).all()) for array in numbers):
+        ledger.add_finding("silent", f"{name}: numbers that are not finite were read")
 
 
 def sweep_parts(ledger: Ledger) -> None:
     """Flip, cut, copy, swap and add parts of results: refused, or the same numbers."""
     rng = ledger.rng
     vary = {"star.mass": ("uniform", 1.5, 2.5)}
-    given = SweepStudy(load("example2_heavy"), vary, n=96, seed=7, steps=20, chunk=32)
+    study = SweepStudy(load("example2_heavy"), vary, n=96, seed=7, steps=20, chunk=32)
     with TemporaryDirectory() as name:
-        whole = Path(name) / "whole"
-        expected = run_study(given, whole)
-        parts = sorted(path.name for path in whole.glob("part-*.parquet"))
+        original = Path(name) / "whole"
+        expected = run_study(study, original)
+        file_names = sorted(path.name for path in original.glob("part-*.parquet"))
         for number in ledger.numbers(300, least=10):
             copy = Path(name) / "copy"
-            shutil.copytree(whole, copy)
+            shutil.copytree(original, copy)
             how = rng.choice(("flip", "cut", "copy", "swap", "stray"))
-            one, other = rng.sample(parts, 2)
-            _damage_part(rng, how, copy / one, copy / other)
-            with ledger.case(f"{how} of {one} ({number})", bound=20.0):
-                found = read_sweep(copy)
-                if not found.equals(expected):
-                    ledger.found("silent", f"{how} of {one} is not seen ({number})")
+            file_name, other_name = rng.sample(file_names, 2)
+            _damage_part(rng, how, copy / file_name, copy / other_name)
+            with ledger.case(f"{how} of {file_name} ({number})", bound=20.0):
+                table = read_sweep(copy)
+                if not table.equals(expected):
+                    ledger.add_finding(
+                        "silent", f"{how} of {file_name} is not seen ({number})"
+                    )
             shutil.rmtree(copy)
 
 
-def _damage_part(rng: random.Random, how: str, one: Path, other: Path) -> None:
-    content = bytearray(one.read_bytes())
+def _damage_part(rng: random.Random, how: str, path: Path, other_path: Path) -> None:
+    content = bytearray(path.read_bytes())
     if how == "flip":
         content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
-        one.write_bytes(content)
+        path.write_bytes(content)
     elif how == "cut":
-        one.write_bytes(content[: rng.randrange(len(content))])
+        path.write_bytes(content[: rng.randrange(len(content))])
     elif how == "copy":
-        shutil.copy(other, one)
+        shutil.copy(other_path, path)
     elif how == "swap":
-        one.write_bytes(other.read_bytes())
-        other.write_bytes(content)
+        path.write_bytes(other_path.read_bytes())
+        other_path.write_bytes(content)
     else:
-        shutil.copy(one, one.with_name("part-0000009.parquet"))
+        shutil.copy(path, path.with_name("part-0000009.parquet"))
 
 
 MEASURED_SCENE = "example2_heavy"
@@ -318,12 +322,12 @@ def measurements(ledger: Ledger) -> None:
         how = _spoil(rng, data)
         name = f"measurement {number}: {how}"
         with ledger.case(name, bound=120.0):
-            found = identify(data, scene)
-            assert isinstance(found, TorqueFit)
-            told = bool(found.warnings) or not found.consistent
-            value = float(found.values[found.names.index("star.inertia.xx")])
-            if not told and abs(value / true.xx - 1.0) > FAR:
-                ledger.found("silent", f"{name}: star.inertia.xx = {value:.3g}")
+            fit = identify(data, scene)
+            assert isinstance(fit, TorqueFit)
+            is_warned = bool(fit.warnings) or not fit.consistent
+            value = float(fit.values[fit.names.index("star.inertia.xx")])
+            if not is_warned and abs(value / true.xx - 1.0) > FAR:
+                ledger.add_finding("silent", f"{name}: star.inertia.xx = {value:.3g}")
 
 
 def _spoil(rng: random.Random, data: dict[str, Array]) -> str:
