@@ -21,7 +21,8 @@ from mpmath import mp, mpf
 from sst_ros import AssemblyError, InputError, certify, load_scene
 
 # Run as a program, this file finds no helper of the tests by itself.
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parent))
 import quad_truth as truth
 from slow_cases import slow_except
 
@@ -346,6 +347,8 @@ def summarize(rows):
     """A line of the table of the documentation for the scenes of each kind."""
     for kind in KINDS:
         some = [row for row in rows if row["kind"] == kind]
+        if not some:
+            continue
         whole = [row for row in some if row["rows"] == len(TIMES)]
         motions = sum(row["motions"] for row in some)
         outside = sum(row["worst"] > 1.0 for row in some)
