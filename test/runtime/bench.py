@@ -149,7 +149,7 @@ class Bench:
         self.stamped.append(stamped(0))
         self.until(lambda: self.output.samples)
 
-    def until(self, condition, timeout=40.0):
+    def until(self, condition, timeout=100.0):
         deadline = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < deadline
