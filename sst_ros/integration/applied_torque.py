@@ -28,7 +28,7 @@ _STATE_STEP = 1e-7
 
 Half of the digits remain.
 """
-WATCHED = 32
+CHECKED_POINTS = 32
 """Parts of a step at whose ends a function of the time is looked at.
 
 A pulse that is longer than one of them is met.
@@ -167,8 +167,8 @@ class AppliedTorque:
         ends themselves are stages.
         """
         assert drive.function is not None
-        spacing = h / WATCHED
-        times = [drive.start + t + spacing * k for k in range(WATCHED + 1)]
+        spacing = h / CHECKED_POINTS
+        times = [drive.start + t + spacing * k for k in range(CHECKED_POINTS + 1)]
         torques = np.array(self.at_times(drive.function, times))
         expected = torques.copy()
         inner = 4.0 * (torques[1:-3] + torques[3:-1]) - torques[:-4] - torques[4:]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sst_ros import load_scene, simulate
-from sst_ros.integration.applied_torque import WATCHED
+from sst_ros.integration.applied_torque import CHECKED_POINTS
 from sst_ros.integration.point import orientation_distance
 
 SCENE = load_scene("example2_heavy")
@@ -34,7 +34,7 @@ def run(torque, **options):
 def test_pulses_longer_than_a_32nd_of_a_step_are_never_missed(method):
     rng = np.random.default_rng(11)
     for _ in range(8):
-        width = MAX_STEP / WATCHED * 10.0 ** rng.uniform(0.01, 1.0)
+        width = MAX_STEP / CHECKED_POINTS * 10.0 ** rng.uniform(0.01, 1.0)
         begin = rng.uniform(0.01, 0.4)
         height = 10.0 ** rng.uniform(-1.5, 0.5) * rng.choice([-1.0, 1.0], 3)
         torque = pulse_of(begin, width, height)
