@@ -158,15 +158,15 @@ def _compile_step(ode: ODE) -> RowsFunction:
     tangent = Routine("tangent", 1 + 2 * size + drive_size + LEGS, 2 * size)
 
     def differentiate(
-        time: Any, point: Sequence[Any], held: Sequence[Any]
+        time: Any, point: Sequence[Any], drive_and_rates: Sequence[Any]
     ) -> Sequence[Any]:
         state, column = point[:size], point[size:]
-        drive, torque_rates = held[:drive_size], held[drive_size:]
+        drive, torque_rates = drive_and_rates[:drive_size], drive_and_rates[drive_size:]
         return tangent(time, *state, *drive, *column, *torque_rates)
 
     def take_step(h: Any, *numbers: Any) -> list[Any]:
-        before, held = numbers[: 2 * size], numbers[2 * size :]
-        each = [held] * len(DOP853.a)
+        before, drive_and_rates = numbers[: 2 * size], numbers[2 * size :]
+        each = [drive_and_rates] * len(DOP853.a)
         # held torques: the motion does not depend on the time
         after, errors = explicit_step(differentiate, DOP853, 0.0, h, before, each)
         assert errors is not None

@@ -75,7 +75,7 @@ class SteppedMotion:
     Attributes:
         samples: those that were taken.
         held: times of control [s] and the torques from then on.
-        start, at, time: first and last valid point, and time of the last [s].
+        start, point, time: first and last valid point, and time of the last [s].
         status, message: 0 at the end, 1 at a limit, -1 where no step resolves the
             motion; why.
         stepper: what made the steps.
@@ -96,14 +96,16 @@ class SteppedMotion:
             task.scene, task.method, task.tolerance, budget=budget, limits=limits,
             max_step=task.max_step,
         )  # fmt: skip
-        self.start = self.at = self.stepper.begin(list(y), _first_method(task))
+        self.start = self.point = self.stepper.begin(list(y), _first_method(task))
         self.time, self.status, self.message = task.span[0], 0, "reached the end"
         self.held: list[tuple[float, Vector3]] = []
         self.samples = Samples(self.stepper)
         self._times: list[float] = task.times.tolist()
         self._next = 0  # of the times that are not taken yet
         self._torque: Torque = (0.0, 0.0, 0.0)
-        self._other: Vector3 | None = None  # on the second solution, where they differ
+        self._second_torque: Vector3 | None = (
+            None  # on the second solution, where they differ
+        )
         self._segment = task.span
         self._moment = (0.0,) * len(self.stepper.dynamics.drive[3:])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
@@ -125,18 +127,18 @@ class SteppedMotion:
             self.time = reached.time
         except CannotStep as error:
             self.status, stop = -1, str(error)
-            self._take(self.time, self.at.y)
+            self._take(self.time, self.point.y)
         if self.status:
             self.message = f"stopped at t = {self.time:.12f} s: {stop}"
         return self
 
     def state(self) -> State:
         """Return the last valid state."""
-        return self._state_of(self.at, self._torque)
+        return self._state_of(self.point, self._torque)
 
-    def _state_of(self, at: Point, torque: Torque) -> State:
-        acting = self.stepper.acting(torque, self.time, at)
-        return State.of(round(self.time * NANOSECONDS), at.y, at.joints, acting)
+    def _state_of(self, point: Point, torque: Torque) -> State:
+        acting = self.stepper.acting(torque, self.time, point)
+        return State.of(round(self.time * NANOSECONDS), point.y, point.joints, acting)
 
     def _follow_profile(self) -> None:
         """Go through segments in each of which the torque is smooth."""
@@ -153,34 +155,36 @@ class SteppedMotion:
         task, end = self._task, round(self._task.span[1] * NANOSECONDS)
         for start in range(0, end, period):
             time = start / NANOSECONDS
-            self._take_if_wanted(time, self.at.y)
+            self._take_if_wanted(time, self.point.y)
             state = (self.state(),) if task.torque.feedback else ()
-            held = task.torque.at(time, *state)
-            self.held.append((time, held))
+            torque = task.torque.at(time, *state)
+            self.held.append((time, torque))
             if task.torque.feedback and task.memoryless:
-                self._other = self._answer_second(time)
+                self._second_torque = self._answer_second(time)
             stop = min(start + period, end)
-            self._advance(time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held)
+            self._advance(
+                time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, torque
+            )
 
     def _answer_second(self, time: float) -> Vector3:
         """Return what a function without memory gives to the second solution [N m]."""
-        at = self.stepper.begin(self.at.z)
-        before = self._torque if self._other is None else self._other
-        torque = self._task.torque.at(time, self._state_of(at, before))
+        point = self.stepper.begin(self.point.z)
+        before = self._torque if self._second_torque is None else self._second_torque
+        torque = self._task.torque.at(time, self._state_of(point, before))
         return clamp(torque, self.stepper.torque.limit)
 
     def _advance(self, begin: float, h: float, end: float, torque: Torque) -> None:
         """Go through a segment of length h under a torque, `begin` to `end` [s]."""
         self._segment = begin, end
         self._torque = self.stepper.torque.acting(torque)
-        self._take_if_wanted(begin, self.at.y)
+        self._take_if_wanted(begin, self.point.y)
         self.stepper.advance(
-            self.at,
+            self.point,
             begin,
             h,
             self._torque,
             self._moment,
-            other=self._other,
+            other=self._second_torque,
             visit=self._pass,
         )
 
@@ -192,7 +196,7 @@ class SteppedMotion:
         if self._next < len(times) and times[self._next] < end:
             first, self._next = self._next, bisect_left(times, end, self._next)
             self._take_between(times[first : self._next])
-        self.time, self.at = end, step.end
+        self.time, self.point = end, step.end
         self._take_if_wanted(end, step.end.y)
         begin, last = self._task.span
         share = (end - begin) / (last - begin)
@@ -217,9 +221,11 @@ class SteppedMotion:
         self._warn_after, most = math.inf, self._budget.per_period
         spent = self._budget.spent - self._spent_before
         if _HOPELESS * most * share < spent:
-            done = f"{spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            progress_text = (
+                f"{spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            )
             advice = f"it stops at {most:,}: shorten it, or change its method"
-            text = f"{self._task.scene.name}: {done}; {advice}"
+            text = f"{self._task.scene.name}: {progress_text}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     def _interpolate(self, step: Step, x: list[float]) -> list[list[float]] | None:
