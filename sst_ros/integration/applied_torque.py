@@ -62,7 +62,8 @@ class AppliedTorque:
     """
 
     def __init__(self, dynamics: Dynamics, limit: float | None) -> None:
-        self._dynamics, self.limit = dynamics, limit
+        self._dynamics = dynamics
+        self.limit = limit
         self._lags = len(dynamics.state) > 7
 
     def acting(self, torque: Torque) -> Torque:

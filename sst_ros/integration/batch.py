@@ -129,7 +129,8 @@ class Batch(Explained):
             ),
             ("torque", None, torque, "must be given in the scene for its profile"),
         )
-        self.scene, self._method = scene, method
+        self.scene = scene
+        self._method = method
         self._scenarios = Scenarios(scene, parameters or {})
         self._scenarios.check()
         self.model = ParametricModel(self._scenarios, profile=profile)
@@ -167,7 +168,8 @@ class Batch(Explained):
         """
         batch = Batch.__new__(Batch)  # a copy would trace its programs again
         vars(batch).update(vars(self))
-        batch._scenarios, batch.columns = scenarios, self.model.columns(scenarios)
+        batch._scenarios = scenarios
+        batch.columns = self.model.columns(scenarios)
         return batch
 
     @check_kinds
@@ -219,13 +221,16 @@ class Batch(Explained):
                 for name, n in whole_numbers.items()
             ),
         )
-        step, count = float(step), int(count)
+        step = float(step)
+        count = int(count)
         loop = advance or partial(self.advance, threads=threads)
         y, code = self.initial(gamma, gamma_dot)
         number = y.shape[1]
         drives = self.drives(torque, number)
-        time, error = np.full(number, np.nan), np.zeros(number)
-        kept, ends = [y.copy()], [0]
+        time = np.full(number, np.nan)
+        error = np.zeros(number)
+        kept = [y.copy()]
+        ends = [0]
         # few calls: each passes all rows
         size = keep_every or (0 if progress else max(count, 1))
         for step_range in slices(count, size, self.scene.name, progress):
@@ -330,12 +335,14 @@ class Batch(Explained):
         y = np.zeros((len(self.model.ode.state), len(angles)))
         y[:7] = start
         if alike and count:
-            y, code = np.repeat(y, count, axis=1), np.repeat(code, count)
+            y = np.repeat(y, count, axis=1)
+            code = np.repeat(code, count)
         return y, code
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
         """Return what acts from outside and what differs, a column a scenario."""
-        drive, columns = self.model.ode.drive, self.columns.inputs
+        drive = self.model.ode.drive
+        columns = self.columns.inputs
         drive_rows = np.zeros((max(len(drive) + len(columns), 1), number))
         if drive[:3] == TORQUE_SYMBOLS:
             limit = self.columns.torque_limit
@@ -448,14 +455,19 @@ class BatchResult(MotionTable):
         t: Array,  # shape (N,) or (samples, N)
         y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
     ) -> None:
-        self._model, self._columns, self._torque = model, columns, torque
+        self._model = model
+        self._columns = columns
+        self._torque = torque
         self.scene = model.scene
         self._axes = ("time", "scenario") if t.ndim == 2 else ("scenario",)
-        self.code, self.fault_time, self.local_error = code, fault_time, local_error
+        self.code = code
+        self.fault_time = fault_time
+        self.local_error = local_error
         self.status = np.where(
             (code < 0) | (code == NOT_FINITE_CODE), -1, np.sign(code)
         )
-        self.t, self._state = t, np.moveaxis(y, -2, -1)
+        self.t = t
+        self._state = np.moveaxis(y, -2, -1)
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
         self.kept: BatchResult | None = None
@@ -471,8 +483,10 @@ class BatchResult(MotionTable):
 
     def _joint(self, name: str) -> Array:
         if name not in self._computed:
-            function, inputs = self._model.outputs[name], self._columns.inputs
-            states, count = np.moveaxis(self._state, -1, 0)[:7], self.t.shape[-1]
+            function = self._model.outputs[name]
+            inputs = self._columns.inputs
+            states = np.moveaxis(self._state, -1, 0)[:7]
+            count = self.t.shape[-1]
             components = np.empty((1 if name == "energy" else 3, *self.t.shape))
             size = max(1, _BATCH_BLOCK * count // max(self.t.size, 1))
             with np.errstate(all="ignore"):

@@ -64,7 +64,9 @@ class BatchSession:
         step: float,
         substeps: int,
     ) -> None:
-        self._batch, self._h, self._substeps = batch, step / substeps, substeps
+        self._batch = batch
+        self._h = step / substeps
+        self._substeps = substeps
         self._y, code = batch.initial(gamma, gamma_dot)
         self._start, self._start_code = self._y.copy(), code.copy()
         number = len(code)
@@ -158,8 +160,10 @@ class BatchSession:
             angles = self._angles[index] if gamma is None else gamma
             rates = self._rates[index] if gamma_dot is None else gamma_dot
             y, code = self._batch.initial(angles, rates, index)
-            self._start[:, index], self._start_code[index] = y, code
-            self._angles[index], self._rates[index] = angles, rates
+            self._start[:, index] = y
+            self._start_code[index] = code
+            self._angles[index] = angles
+            self._rates[index] = rates
         code = self._start_code[index]
         self._y[:, index] = self._start[:, index]
         self.state.code[index] = code
@@ -195,7 +199,9 @@ class BatchSession:
         time = (
             (self._steps_done - np.maximum(self._begun, 0)) * self._substeps * self._h
         )
-        batch, code, fault = self._batch, self.state.code.copy(), self.fault_time.copy()
+        batch = self._batch
+        code = self.state.code.copy()
+        fault = self.fault_time.copy()
         torque = self._drives[:3].T.copy()
         last = np.where(np.isnan(fault), time, fault)
         return batch.result_of(
@@ -204,7 +210,8 @@ class BatchSession:
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""
-        time, code = self.fault_time[rows], self.state.code[rows]
+        time = self.fault_time[rows]
+        code = self.state.code[rows]
         begins = np.ceil(time / self._h - 0.1 * EARLIEST) - 1.0
         y = np.ascontiguousarray(self._y[:, rows])
         drives = np.ascontiguousarray(self._drives[:, rows])

@@ -81,7 +81,8 @@ class ColumnStep:
     """
 
     def __init__(self, model: ParametricModel, method: Tableau) -> None:
-        self._model, self._method = model, method
+        self._model = model
+        self._method = method
         self.size = len(model.ode.state)
         self.given = len(model.ode.drive) + len(model.names)
         self.varied = slice(len(model.ode.drive), self.given)
@@ -100,7 +101,8 @@ class ColumnStep:
             "crossing": trace(share_of_crossing, ends),
         }
         functions = compile_columns(self.traced, len(shared))
-        self.advance, self.distances = functions["advance"], functions["distances"]
+        self.advance = functions["advance"]
+        self.distances = functions["distances"]
         self.crossing = functions["crossing"]
 
     def _advance(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
@@ -163,8 +165,10 @@ class Block:
     """
 
     def __init__(self, step: ColumnStep, width: int) -> None:
-        self._step, self.width = step, width
-        self._size, self._limits = step.size, step.limits
+        self._step = step
+        self.width = width
+        self._size = step.size
+        self._limits = step.limits
         rows = step.size + 2 * step.limits + 1
         self._states = spaced_rows(rows, width), spaced_rows(rows, width)
         self._current = 0  # which of the two has the state
@@ -290,7 +294,9 @@ class Block:
         Returns 1 + the index of the limit, 0 where none is passed, and the share of the
         step, 1 where none is.
         """
-        count, limits, size = len(columns), self._limits, self._size
+        count = len(columns)
+        limits = self._limits
+        size = self._size
         limit_codes = np.zeros(count, dtype=np.int64)
         share = np.ones(count)
         padded = np.resize(columns, -(-count // LANES) * LANES)
@@ -355,7 +361,8 @@ def share_of_crossing(
     high = select(-GRAZING - after, 1.0, lowest)
     least = value(high)
     least = select(-after, after, least)
-    end, low = high, 0.0
+    end = high
+    low = 0.0
     for _ in range(_EVENT_HALVINGS):
         middle = 0.5 * (low + end)
         outside = -value(middle)

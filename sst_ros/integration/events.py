@@ -85,7 +85,7 @@ def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
         if not rising:
             is_outside = distance(0.0) < -GRAZING
             shrinks = slope(0.0) < 0.0
-            # A joint at rest has no slope yet; where it ends says which way it goes.
+            # A joint at rest has no slope yet: it counts where it ends outside.
             ends_outside = distance(h) < -GRAZING
             return 0.0 if is_outside or shrinks or ends_outside else None
         if distance(h) >= 0.0 or (distance(h) >= -GRAZING and not falling):

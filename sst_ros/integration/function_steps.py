@@ -96,7 +96,9 @@ class FunctionSteps:
             raise ValueError(
                 "a derivative of its own has no Jacobian, which the method needs"
             )
-        self.method, self._ode, self._torque = method, ode, torque
+        self.method = method
+        self._ode = ode
+        self._torque = torque
         self._derivative = derivative
         self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
         self.interpolation_cost = 3 * self.cost + 5
@@ -187,11 +189,13 @@ class FunctionSteps:
 
     def _linearise(self, t: float, y: Sequence[float], drive: Drive) -> Linearisation:
         """Linearise: exact by the state, by differences of the torque."""
-        size, torque = self._size, self._torque.of_drive(drive, t, y)
+        size = self._size
+        torque = self._torque.of_drive(drive, t, y)
         moment = drive.numbers[3:]
         numbers = self._ode.linearised_by_torque(t, *y, *torque, *moment)
         rows = np.array(numbers).reshape(size + 5, size)
-        slope, by_time = rows[0], rows[1]
+        slope = rows[0]
+        by_time = rows[1]
         by_state, by_torque = rows[2 : size + 2], rows[size + 2 :]
         rate = self._torque.rate(drive, t, y, torque)
         feedback = self._torque.by_state(drive, t, y, torque)
@@ -329,7 +333,9 @@ def compile_rows_by_stage(ode: ODE, method: Tableau) -> RowsFunction:
 
 
 def _trace_by_stage(ode: ODE, method: Tableau) -> dict[str, Program]:
-    size, drive, lagged = len(ode.state), len(ode.drive), lagged_torques(ode)
+    size = len(ode.state)
+    drive = len(ode.drive)
+    lagged = lagged_torques(ode)
     return {
         "slope": ode.program,
         "joints": ode.dynamics.joints_program,
@@ -442,8 +448,12 @@ class FeedbackSteps(FunctionSteps):
 
         `joints` are those of y.
         """
-        functions, size, moment = self._functions, self._size, drive.numbers[3:]
-        evaluate, function, start = self._torque.of_state, drive.function, drive.start
+        functions = self._functions
+        size = self._size
+        moment = drive.numbers[3:]
+        evaluate = self._torque.of_state
+        function = drive.function
+        start = drive.start
         assert function is not None
         slopes: list[float] = []
         point = y
@@ -465,7 +475,9 @@ class FeedbackSteps(FunctionSteps):
         if dense is None:
             return super().interpolate(step)
         a, weights_of_terms = _arrays_of_dense(dense)
-        size, h, begin = self._size, step.h, np.array(step.begin.y)
+        size = self._size
+        h = step.h
+        begin = np.array(step.begin.y)
         slopes = np.array(step.stages).reshape(-1, size)
         end = np.array(step.end.y)
         slopes = np.vstack([slopes, self.slope(step.t + h, step.end.y, step.drive)])
@@ -504,7 +516,9 @@ _WORST_OF_DENSE = 0.83
 @lru_cache(maxsize=64)
 def compile_stages(ode: ODE, method: Tableau) -> dict[str, Function]:
     """Compile the programs of `trace_stages`, and `joints`."""
-    size, drive, lagged = len(ode.state), len(ode.drive), lagged_torques(ode)
+    size = len(ode.state)
+    drive = len(ode.drive)
+    lagged = lagged_torques(ode)
     stages = trace_stages(method, size, drive, lagged)
     programs = {
         "slope": ode.program,
@@ -532,7 +546,8 @@ def trace_stages(
     stages = len(method.a)
 
     def take_stage(number: int, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, stage_inputs = inputs[:size], inputs[size:]
+        y = inputs[:size]
+        stage_inputs = inputs[size:]
         slopes = [stage_inputs[size * k : size * (k + 1)] for k in range(number)]
         point = stage_inputs[size * number : size * (number + 1)]
         slopes.append(slope(t, *point, *stage_inputs[size * (number + 1) :]))
@@ -543,7 +558,9 @@ def trace_stages(
         return (*slopes[-1], *following, *joints(*following[:7]))
 
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, z, step_ends = inputs[:size], inputs[size : 2 * size], inputs[2 * size :]
+        y = inputs[:size]
+        z = inputs[size : 2 * size]
+        step_ends = inputs[2 * size :]
         half = len(step_ends) // 2
         first, second = (
             NewState([*end[:size]], [*end[size:]] or None)

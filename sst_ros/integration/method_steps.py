@@ -59,7 +59,8 @@ class MethodSteps:
     """
 
     def __init__(self, ode: ODE, method: Method) -> None:
-        self.method, self._ode = method, ode
+        self.method = method
+        self._ode = ode
         implicit = isinstance(method, Rosenbrock)
         self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
         self._size = len(ode.state)
@@ -67,7 +68,8 @@ class MethodSteps:
     @cached_property
     def _programs(self) -> dict[str, Program]:
         """`pair`, `single` and `slope` of this scene, and what they call."""
-        ode, method = self._ode, self.method
+        ode = self._ode
+        method = self.method
         programs = {
             "slope": ode.program,
             "joints": ode.dynamics.joints_program,
@@ -123,7 +125,9 @@ class MethodSteps:
         self, t: float, h: float, count: int, y: Sequence[float], drive: Drive
     ) -> list[float]:
         """Advance a state by `count` steps of h; their errors are not looked at."""
-        single, numbers, state = self._functions["single"], drive.numbers, [*y]
+        single = self._functions["single"]
+        numbers = drive.numbers
+        state = [*y]
         for k in range(count):
             state = single(t + k * h, h, *state, *numbers)
         return state
@@ -226,7 +230,8 @@ def trace_steps(
         return Linearisation(rows[0], rows[1], rows[2:])
 
     def take_pair(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, z = inputs[:size], inputs[size : 2 * size]
+        y = inputs[:size]
+        z = inputs[size : 2 * size]
         drive_inputs = inputs[2 * size :]
         second_drives = drive_inputs[len(drives) :]
         # of the step of y, and of both steps of z, which may have the same
@@ -250,7 +255,8 @@ def trace_steps(
         return (*pair.y, *pair.z, *angles, pair.size, total)
 
     def take_single(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, numbers = inputs[:size], inputs[size:]
+        y = inputs[:size]
+        numbers = inputs[size:]
         results = step(t, h, *y, *(y if implicit else ()), *numbers)
         return tuple(normalise(results[:size]))
 

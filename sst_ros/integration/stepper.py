@@ -73,8 +73,12 @@ WHOLE_MOTION_BUDGET = 10_000_000
 They take minutes in plain Python.
 """
 
-_LARGEST_GROWTH, _LARGEST_SHRINKAGE, _SAFETY = 5.0, 0.2, 0.9
-"""Factors by which a step changes at most; share of the step that the error allows."""
+_LARGEST_GROWTH = 5.0
+"""Factor by which a step grows at most: one small estimate may be chance."""
+_LARGEST_SHRINKAGE = 0.2
+"""Factor by which it shrinks at most: an error far too large says little."""
+_SAFETY = 0.9
+"""Share of the step that the error allows, so that few steps are rejected."""
 _LAST_SLIVER = 1e-3
 """A step also takes the rest of a period that is shorter than this share of it."""
 _SHORTEST_STEP = 1e-15
@@ -127,7 +131,8 @@ class LimitReached(Exception):
     """A limit of the scene ends the motion at a time [s]."""
 
     def __init__(self, limit: Limit, time: float) -> None:
-        self.limit, self.time = limit, time
+        self.limit = limit
+        self.time = time
         super().__init__(limit.reason)
 
 
@@ -150,8 +155,10 @@ class EvaluationBudget:
     """
 
     def __init__(self, per_period: int, *, whole_run: bool = False) -> None:
-        self.per_period, self._whole_run = per_period, whole_run
-        self.spent, self._end = 0, per_period
+        self.per_period = per_period
+        self._whole_run = whole_run
+        self.spent = 0
+        self._end = per_period
 
     def begin(self) -> None:
         """Begin a period."""
@@ -220,7 +227,8 @@ class Stepper:
         traced = derivative is None
         self.torque = AppliedTorque(self.dynamics, scene.torque_limit)
         self._derivative = derivative
-        self._tolerance, self._max_step = tolerance, max_step
+        self._tolerance = tolerance
+        self._max_step = max_step
         self._methods = methods_of(method)
         # A derivative of its own has no Jacobian to choose a method by.
         self._chooses = len(self._methods) > 1 and traced
@@ -284,7 +292,8 @@ class Stepper:
         drive = self._hold(torque, start, moment)
         second = None if other is None else Drive((*other, *moment))
         self.budget.begin()
-        x, stops = 0.0, list[float]()
+        x = 0.0
+        stops = list[float]()
         steps = self._steps_of(drive, point.method)
         while x < h:
             step = self._take_step(x, h, point, drive, second, stops, steps)
@@ -347,7 +356,8 @@ class Stepper:
 
     def _make_steps(self, drive: Drive, method: Method) -> Steps:
         """Make the steps of a method under a drive."""
-        sine, function = drive.sine, drive.function
+        sine = drive.sine
+        function = drive.function
         if sine is not None:
             limit = self.torque.limit_of(sine)
             ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
@@ -588,7 +598,8 @@ def better_method(
     It is the one in use where none would. `steps` is the length of a step times the
     eigenvalues of the Jacobian; `only_stiff` looks for stiffness alone.
     """
-    radius, decay = np.abs(steps).max(), -steps.real.min()
+    radius = np.abs(steps).max()
+    decay = -steps.real.min()
     implicit = isinstance(method, Rosenbrock)
     if not implicit and decay > _STIFF and decay > 0.5 * radius:
         return RODAS5P, f"stiff: step times fastest decay is {decay:.2g}"

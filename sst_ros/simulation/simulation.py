@@ -346,7 +346,8 @@ class Simulation(Explained):
         )
         if time_ns == began:
             return self._as_state(self._before)
-        start, h = began / NANOSECONDS, (time_ns - began) / NANOSECONDS
+        start = began / NANOSECONDS
+        h = (time_ns - began) / NANOSECONDS
         _, _, torque, moment = self._current
         point = self._stepper.advance(self._before.point, start, h, torque, moment)
         return self._as_state(_Instant(time_ns, point, torque, moment))

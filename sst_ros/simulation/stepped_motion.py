@@ -91,13 +91,16 @@ class SteppedMotion:
         limits: bool = True,
         progress: bool = False,
     ) -> None:
-        self._task, self._budget = task, budget
+        self._task = task
+        self._budget = budget
         self.stepper = Stepper(
             task.scene, task.method, task.tolerance, budget=budget, limits=limits,
             max_step=task.max_step,
         )  # fmt: skip
         self.start = self.point = self.stepper.begin(list(y), _first_method(task))
-        self.time, self.status, self.message = task.span[0], 0, "reached the end"
+        self.time = task.span[0]
+        self.status = 0
+        self.message = "reached the end"
         self.held: list[tuple[float, Vector3]] = []
         self.samples = Samples(self.stepper)
         self._times: list[float] = task.times.tolist()
@@ -121,12 +124,14 @@ class SteppedMotion:
                 else:
                     self._hold_periods(self._task.period)
         except LimitReached as reached:
-            self.status, stop = 1, reached.limit.reason
+            self.status = 1
+            stop = reached.limit.reason
             end = math.floor(reached.time * NANOSECONDS) / NANOSECONDS
             self._take_between([end])
             self.time = reached.time
         except CannotStep as error:
-            self.status, stop = -1, str(error)
+            self.status = -1
+            stop = str(error)
             self._take(self.time, self.point.y)
         if self.status:
             self.message = f"stopped at t = {self.time:.12f} s: {stop}"
@@ -142,7 +147,8 @@ class SteppedMotion:
 
     def _follow_profile(self) -> None:
         """Go through segments in each of which the torque is smooth."""
-        task, (begin, end) = self._task, self._task.span
+        task = self._task
+        begin, end = task.span
         kinks = task.torque.kinks(task.scene.torque_limit, end)
         if len(task.breaks) or len(kinks):
             kinks = np.union1d(task.breaks, kinks)
@@ -152,7 +158,8 @@ class SteppedMotion:
 
     def _hold_periods(self, period: int) -> None:
         """Go through control periods, which hold the torques of a function."""
-        task, end = self._task, round(self._task.span[1] * NANOSECONDS)
+        task = self._task
+        end = round(task.span[1] * NANOSECONDS)
         for start in range(0, end, period):
             time = start / NANOSECONDS
             self._take_if_wanted(time, self.point.y)
@@ -190,13 +197,16 @@ class SteppedMotion:
 
     def _pass(self, step: Step) -> None:
         """Take the samples in a step, and note where the motion stands."""
-        self._last, self._last_begin = step, self._segment[0] + step.t
+        self._last = step
+        self._last_begin = self._segment[0] + step.t
         end = self._segment[1] if step.last else self._last_begin + step.h
         times = self._times
         if self._next < len(times) and times[self._next] < end:
-            first, self._next = self._next, bisect_left(times, end, self._next)
+            first = self._next
+            self._next = bisect_left(times, end, self._next)
             self._take_between(times[first : self._next])
-        self.time, self.point = end, step.end
+        self.time = end
+        self.point = step.end
         self._take_if_wanted(end, step.end.y)
         begin, last = self._task.span
         share = (end - begin) / (last - begin)
@@ -206,7 +216,8 @@ class SteppedMotion:
 
     def _take_between(self, times: list[float]) -> None:
         """Take samples at ascending times in the last step [s]."""
-        step, begin = self._last, self._last_begin
+        step = self._last
+        begin = self._last_begin
         if times[0] <= begin:  # the time of its begin, but for rounding
             self._take(times.pop(0), step.begin.y)
         states = self._interpolate(step, [time - begin for time in times])
@@ -218,7 +229,8 @@ class SteppedMotion:
 
     def _warn_if_hopeless(self, share: float) -> None:
         """Warn once if the rest of the motion would far exceed the budget."""
-        self._warn_after, most = math.inf, self._budget.per_period
+        self._warn_after = math.inf
+        most = self._budget.per_period
         spent = self._budget.spent - self._spent_before
         if _HOPELESS * most * share < spent:
             progress_text = (

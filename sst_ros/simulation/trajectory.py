@@ -65,7 +65,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-_KEY, _FORMAT = "sst_ros", 1
+_KEY = "sst_ros"
+"""Of the text in a file that holds what is no column."""
+_FORMAT = 1
+"""Number of the form of that text, for a later one to be refused here."""
 _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
@@ -351,7 +354,8 @@ class Trajectory(MotionTable):
         They are those under `torque` and the scene's loads. A moment from a topic is no
         part of them.
         """
-        model, y = self._dynamics.model._replace(time_constant=None), self._columns
+        model = self._dynamics.model._replace(time_constant=None)
+        y = self._columns
         with np.errstate(all="ignore"):
             slope = kernel.derivative(model, y, triple(self.torque.T))
             accelerations = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
@@ -380,7 +384,8 @@ class Trajectory(MotionTable):
     def energy(self) -> Array:
         """Kinetic and potential energy [J], shape (n,)."""
         with np.errstate(all="ignore"):
-            model, columns = self._dynamics.model, self._columns
+            model = self._dynamics.model
+            columns = self._columns
             total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(
                 model, columns
             )
@@ -404,7 +409,8 @@ class Trajectory(MotionTable):
 
         0 if exact.
         """
-        rotation, geometry = rotation_matrix(self.quaternion), Geometry.of(self.scene)
+        rotation = rotation_matrix(self.quaternion)
+        geometry = Geometry.of(self.scene)
         return float(
             np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0)
         )
@@ -525,7 +531,8 @@ class Trajectory(MotionTable):
             MissingDependency: pyarrow (.parquet) or pandas (.csv) is not installed.
 
         """
-        path, ends = Path(path), f"must end in {' or '.join(SUFFIXES)}"
+        path = Path(path)
+        ends = f"must end in {' or '.join(SUFFIXES)}"
         free = overwrite or not os.path.exists(path)  # noqa: PTH110  # Path's raises on long names
         refuse_unless(
             "save",
@@ -696,7 +703,8 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
             return states
         limit = trajectory.scene.torque_limit or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
-    t, size = trajectory.t, len(trajectory._dynamics.state)
+    t = trajectory.t
+    size = len(trajectory._dynamics.state)
     samples = np.hstack(
         [trajectory.quaternion, trajectory.body_rate, trajectory.torque]
     )
