@@ -252,11 +252,11 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
     """
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
-    local = task.tolerance  # of a step
+    step_tolerance = task.tolerance
     kept: SteppedMotion | None = None
     last_excess = math.inf
     for _ in range(_RUN_ATTEMPTS):
-        attempt = task if local == task.tolerance else replace(task, tolerance=local)
+        attempt = replace(task, tolerance=step_tolerance)
         motion = SteppedMotion(
             attempt, start_of(task.scene), budget, progress=progress
         ).run()
@@ -269,11 +269,12 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
         if remembers or motion.status < 0 or is_met or gains_little:
             break
         last_excess = excess
-        local = max(local / (5.0 * excess), _FINEST)
+        step_tolerance = max(step_tolerance / (5.0 * excess), _FINEST)
     assert kept is not None
     factor = 1.0
     if remembers and task.torque.feedback:
-        factor = _UNSEEN_ANSWER  # the controller's, to the error
+        # The estimate does not see how the controller answers the error.
+        factor = _UNSEEN_ANSWER
     return _trajectory(task, kept, budget.spent, factor=factor)
 
 

@@ -68,7 +68,7 @@ if TYPE_CHECKING:
 _KEY = "sst_ros"
 """Of the text in a file that holds what is no column."""
 _FORMAT = 1
-"""Number of the form of that text, for a later one to be refused here."""
+"""Number of the form of that text; a file of another form is refused."""
 _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
