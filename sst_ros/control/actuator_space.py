@@ -277,12 +277,15 @@ class ActuatorSpaceMap:
     def _find_orientation(self, guess: Quaternion, gamma: Vector3) -> Quaternion:
         """Return the unit quaternion of the assembly at gamma closest to `guess`."""
         carriages = self.carriages(gamma)
-        best, least, q = guess, math.inf, guess
+        best = guess
+        q = guess
+        least = math.inf
         for _ in range(_INVERSION_STEPS):
             x, y, z, w, *residuals = self._newton(*q, *carriages)
             largest = max(map(abs, residuals))
             if largest < least:
-                best, least = q, largest
+                best = q
+                least = largest
             if not largest > ANGLE_ROUNDING:
                 break
             q = (x, y, z, w)
@@ -310,7 +313,8 @@ class ActuatorSpaceMap:
 
         The steps begin at `guesses`, shape (n, 4).
         """
-        carriages, q = self.carriages(gamma.T), list(guesses.T)
+        carriages = self.carriages(gamma.T)
+        q = list(guesses.T)
         for _ in range(steps):
             *q, first, second, third = self.newton_step(*q, *carriages)
             if np.abs((first, second, third)).max(initial=0.0) < 1e-9:

@@ -278,7 +278,8 @@ class InverseDynamics(Explained):
         self, quaternion: Quaternion, numbers: Sequence[float]
     ) -> SingularConfiguration:
         """Return why there is no torque; raises InputError where numbers are wrong."""
-        lost, finite = find_lost_meaning([*numbers, quaternion]), False
+        lost = find_lost_meaning([*numbers, quaternion])
+        finite = False
         refuse_unless("inverse dynamics", ("state", tuple(numbers), not lost, lost))
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             sizes = len(numbers), len(quaternion)
@@ -339,7 +340,8 @@ class ChannelState:
 
         It receives gamma [rad] and gamma_dot [rad/s], as they are measured.
         """
-        channel, noise = self._channel, []
+        channel = self._channel
+        noise: list[float] = []
         if channel.counts and self._before is None:
             earlier = axpy(1.0, gamma, -channel.period, gamma_dot)
             self._before = tuple(map(channel.count, earlier))
@@ -378,7 +380,8 @@ class Controller:
     ) -> None:
         model = scene_of(model)
         self._motion, self._settings, self._period_s = motion, settings, period_s
-        geometry, start = Geometry.of(model), motion.at(0.0)
+        geometry = Geometry.of(model)
+        start = motion.at(0.0)
         self._inverse, self._space = InverseDynamics(model), ActuatorSpaceMap(geometry)
         self._begin = start.quaternion, start.gamma
         rotation = rotation_matrix(start.quaternion)
@@ -424,7 +427,8 @@ class Controller:
         Raises InputError where the integral action would be unstable.
         """
         settings = settings or self._settings
-        column, rate = np.array(self.inertia)[:, None], settings.integral_rate
+        column = np.array(self.inertia)[:, None]
+        rate = settings.integral_rate
         gains = law.feedback_gains(
             column, lambda name: getattr(settings, name), settings.direct
         )
@@ -523,7 +527,8 @@ class Controller:
             raise self._failure
         if lost := "" if type(time) is float else find_lost_meaning(time):
             refuse_unless("control", ("time", time, False, lost))
-        requirement, observes = "must be finite numbers", self._settings.observes
+        requirement = "must be finite numbers"
+        observes = self._settings.observes
         try:
             numbers = (*measured.gamma, *measured.gamma_dot)
             refuse_unless(
@@ -611,7 +616,8 @@ class TrackingMetrics:
 
     def add(self, track: Track) -> None:
         """Add the next part of the record, of one sample or more."""
-        error, torque = np.abs(track.error), track.torque
+        error = np.abs(track.error)
+        torque = track.torque
         products = (
             error**2,
             torque**2,

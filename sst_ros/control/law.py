@@ -254,7 +254,7 @@ class ControlLaw(NamedTuple):
         to the feedforward.
         """
         mode = self.settings.mode
-        _, held_torque = torques
+        present_torque, held_torque = torques
         feedforward = held_torque if self.settings.feeds else ZERO
         feedback: Triple = ZERO
         summed: Triple = ZERO  # what the integral sums
@@ -272,7 +272,7 @@ class ControlLaw(NamedTuple):
                     desired, observed, body_rate, integral
                 )
             needed = self.torque(observed, body_rate, acceleration)
-            feedback = axpy(1.0, needed, -1.0, torques[0])
+            feedback = axpy(1.0, needed, -1.0, present_torque)
         elif mode != "feedforward":
             summed = error
             feedback = _by_joint(self.inertia, self._correct(integral, error, rates))
@@ -300,7 +300,8 @@ class ControlLaw(NamedTuple):
         rate = triple(gm.dot3(row, desired.body_rate) for row in turn)
         forward = triple(gm.dot3(row, desired.body_acceleration) for row in turn)
         moving = axpy(1.0, forward, -1.0, gm.cross3(body_rate, rate))
-        error, rates = self.turn(between), axpy(1.0, rate, -1.0, body_rate)
+        error = self.turn(between)
+        rates = axpy(1.0, rate, -1.0, body_rate)
         return error, add(moving, self._correct(integral, error, rates))
 
     def _correct(self, integral: Any, error: Triple, rates: Triple) -> Triple:
@@ -330,7 +331,8 @@ def feedback_gains(
             for name in ("stiffness", "damping")
         )
         return kp, kd
-    ones, bandwidth = np.ones_like(inertia), value("bandwidth")
+    ones = np.ones_like(inertia)
+    bandwidth = value("bandwidth")
     return ones * bandwidth**2, ones * (2.0 * value("damping_ratio") * bandwidth)
 
 

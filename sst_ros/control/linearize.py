@@ -98,7 +98,8 @@ class LinearModel(Explained, ReadOnly):
 
         Needs the package control.
         """
-        x, commands = list(self.states), [f"command_{k}" for k in (1, 2, 3)]
+        x = list(self.states)
+        commands = [f"command_{k}" for k in (1, 2, 3)]
         system = self.A, self.B, np.eye(len(x)), np.zeros_like(self.B), self.dt or 0
         return require("control").StateSpace(
             *system, states=x, outputs=x, inputs=commands
@@ -172,10 +173,14 @@ def linearize(
     )
     assert acting is not None
     if isinstance(state, State):
-        quaternion, rate, lagged = state.quaternion, state.body_rate, state.torque
+        quaternion = state.quaternion
+        rate = state.body_rate
+        lagged = state.torque
     else:
         x, y, z, w, *body_rate = start_of(with_initial(scene, state))
-        quaternion, rate, lagged = (x, y, z, w), triple(body_rate), acting
+        quaternion = (x, y, z, w)
+        rate = triple(body_rate)
+        lagged = acting
     by_gamma = coordinates == "gamma"
     if by_gamma:
         InverseDynamics(scene).torque(quaternion, rate, ZERO)  # refuses singularities
@@ -298,7 +303,8 @@ def _turns(y: Array) -> tuple[Array, Array]:
 
     Shapes (n + 1, n) and (n, n + 1).
     """
-    size, q = len(y), y[:4]
+    size = len(y)
+    q = y[:4]
     by_axis = [quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]
     turn = np.array(by_axis).T
     from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
