@@ -272,7 +272,8 @@ class BallEquations:
             piece = self._profile.piece(begin, end)
 
         def commanded(time: Any, *y: Any) -> Sequence[Any]:
-            command = map(arb, piece.at(time))
+            held = piece.held
+            command = piece.at(time) if held is None else map(arb, held)
             return function(time, *y[:size], *command, *y[size:])
 
         return commanded

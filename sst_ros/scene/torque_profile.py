@@ -304,7 +304,12 @@ class FunctionTorque(TorqueProfile):
         """See `TorqueProfile`."""
         value = self._function(time, *state)
         vector = finite_vector(value)
-        return _three(value, f"torque({time:g})") if vector is None else vector
+        if vector is None:
+            allowed = (
+                "must be three finite numbers: a function must return three torques"
+            )
+            raise refusal("torque", f"torque({time:g})", value, f"{allowed} [N m]")
+        return vector
 
     __call__ = at
 
