@@ -44,10 +44,10 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     """
     gamma = np.array(scene.initial.gamma)
     gamma_dot = np.array(scene.initial.gamma_dot)
-    near = scene.initial.orientation
-    if near is not None:
+    orientation = scene.initial.orientation
+    if orientation is not None:
         rotation = kinematics.admissible(
-            geometry, gamma, rotation_matrix(near)
+            geometry, gamma, rotation_matrix(orientation)
         ).rotation
     else:
         rotation = kinematics.admissible(geometry, gamma).rotation
@@ -63,13 +63,17 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
 
 
 def initial_states(
-    geometries: Geometry, which: NDArray[np.intp], gamma: Array, gamma_dot: Array
+    geometries: Geometry,
+    geometry_index: NDArray[np.intp],
+    gamma: Array,
+    gamma_dot: Array,
 ) -> tuple[Array, NDArray[np.int64]]:
     """States at t = 0 of many runs, of which one that cannot start stops no other.
 
     They have gamma [rad] and gamma_dot [rad/s], shape (n, 3), and the geometries of
-    index `which`, shape (n,). Returns quaternions and body rates [rad/s], shape (7, n),
-    at rest where there is no start, and codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
+    index `geometry_index`, shape (n,). Returns quaternions and body rates [rad/s],
+    shape (7, n), at rest where there is no start, and codes, shape (n,): 0, NO_ASSEMBLY
+    or NO_RATE.
     """
     states = np.zeros((7, len(gamma)))
     quaternions, rates = states[:4], states[4:]
@@ -77,7 +81,7 @@ def initial_states(
     codes = np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64)
     for first in range(0, len(gamma), BLOCK):
         block = slice(first, first + BLOCK)
-        starts = np.column_stack([which[block], gamma[block]])
+        starts = np.column_stack([geometry_index[block], gamma[block]])
         distinct, index = np.unique(starts, axis=0, return_inverse=True)
         index = index.ravel()
         own = geometries.of_rows(distinct[:, 0].astype(np.intp))
@@ -97,7 +101,7 @@ def initial_states(
         moves &= ~singular
         rows = rows[moves]
         rotation = assemblies.rotation[selected[moves]]
-        geometry = geometries.of_rows(which[rows])
+        geometry = geometries.of_rows(geometry_index[rows])
         rates[:, rows] = _body_rates(geometry, rotation, gamma_dot[rows]).T
     return states, codes
 
@@ -125,8 +129,10 @@ def start_of(scene: Scene) -> tuple[float, ...]:
     in_stroke = bool(np.all((gamma >= 0) & (gamma <= geometry.arc)))
     inside = scene.stroke.at_end != "stop" or in_stroke
     ends = ", ".join(f"{arc:.6f}" for arc in geometry.arc)
-    allowed = f"must lie in the stroke, 0 to ({ends}) rad"
-    refuse_unless(scene.name, ("initial.gamma", scene.initial.gamma, inside, allowed))
+    requirement = f"must lie in the stroke, 0 to ({ends}) rad"
+    refuse_unless(
+        scene.name, ("initial.gamma", scene.initial.gamma, inside, requirement)
+    )
     return initial_state(scene, geometry)
 
 
@@ -140,15 +146,17 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     The scene may have bodies, payload, rotors, torque limits and an external moment, as
     the paper has them or in its inertias and n_ext; InputError names each other term.
     """
-    allowed = "the equations of the paper have no such term: use equations = quaternion"
+    requirement = (
+        "the equations of the paper have no such term: use equations = quaternion"
+    )
     checks: list[Check] = []
     for name in ("gravity", "friction", "springs", "own_loads"):
         term = getattr(scene, name)
-        checks.append((name, term, not term, allowed))
+        checks.append((name, term, not term, requirement))
     lag = scene.actuators and scene.actuators.time_constant
-    checks.append(("actuators.time_constant", lag, not scene.lags, allowed))
+    checks.append(("actuators.time_constant", lag, not scene.lags, requirement))
     at_end = scene.stroke.at_end
-    checks.append(("stroke.at_end", at_end, at_end != "elastic", allowed))
+    checks.append(("stroke.at_end", at_end, at_end != "elastic", requirement))
     refuse_unless(scene.name, *checks)
     mechanism = virtual_work.Mechanism.of(scene)
     constant = np.array((scene.moment and scene.moment.value) or ZERO)

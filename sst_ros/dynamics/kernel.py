@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from sst_ros.dynamics.model import ElasticStops, Leg, Model, model_of
+from sst_ros.dynamics.model import JOINT_NAMES, ElasticStops, Leg, Model, model_of
 from sst_ros.dynamics.own_loads import LoadConstants, load_program, run_program
 from sst_ros.mechanism.generic_math import (
     Quadruple,
@@ -120,9 +120,10 @@ def actuator_torque(
     inertia, acting, (first, second, third) = balance(model, q, rate, ZERO, moment)
     rows = zip(symmetric_rows(inertia), acting, strict=True)
     missing = triple(dot3(row, acceleration) - force for row, force in rows)
-    others = (cross3(second, third), cross3(third, first), cross3(first, second))
-    determinant = dot3(first, others[0])
-    return triple(dot3(missing, other) / determinant for other in others), determinant
+    cofactors = (cross3(second, third), cross3(third, first), cross3(first, second))
+    determinant = dot3(first, cofactors[0])
+    torque = triple(dot3(missing, cofactor) / determinant for cofactor in cofactors)
+    return torque, determinant
 
 
 def balance(
@@ -152,10 +153,11 @@ def balance(
         force = add(force, own.star)
     jacobian = []
     for k, (leg, drive) in enumerate(zip(model.legs, torque, strict=True)):
-        at = leg_motion(leg, rows, rate)
-        a, p, u, g, a_dot, gamma_dot = at.a, at.p, at.u, at.g, at.a_dot, at.gamma_dot
+        motion = leg_motion(leg, rows, rate)
+        a, a_dot, gamma_dot = motion.a, motion.a_dot, motion.gamma_dot
+        p, u, g = motion.p, motion.u, motion.g
         jacobian.append(g)
-        a_rest, gamma_rest = rest_accelerations(at, rate)
+        a_rest, gamma_rest = rest_accelerations(motion, rate)
         # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
         a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
         c_inertia, c_slope = 0.0, 0.0
@@ -173,13 +175,13 @@ def balance(
             multiply(c_inertia, g),
             axpy(a_inertia, g, c_inertia, p),
         )
-        at_gamma, at_mu, at_beta = joint_torques(at, field)
+        at_gamma, at_mu, at_beta = joint_torques(motion, field)
         if own is not None:
             at_gamma, at_mu, at_beta = add((at_gamma, at_mu, at_beta), own.joints[k])
         force_gamma = force_gamma - at_gamma
         if not (type(at_mu) is float and at_mu == 0.0):
             force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
-        force = triple(f + at_beta * b for f, b in zip(force, at.b, strict=True))
+        force = triple(f + at_beta * b for f, b in zip(force, motion.b, strict=True))
         force = triple(
             f - force_a * along - force_gamma * across
             for f, along, across in zip(force, p, g, strict=True)
@@ -194,10 +196,11 @@ def balance(
 
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
-    parts = [(part, kind) for part in (joint_angle, joint_rate) for kind in range(3)]
-    of_legs = [
-        [part(at, kind) for part, kind in parts] for at in leg_motions(model, state)
-    ]
+    of_legs = []
+    for motion in leg_motions(model, state):
+        angles = [joint_angle(motion, joint) for joint in range(3)]
+        rates = [joint_rate(motion, joint) for joint in range(3)]
+        of_legs.append([*angles, *rates])
     return Joints(*zip(*of_legs, strict=True))
 
 
@@ -223,11 +226,11 @@ def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
     return LegMotion(leg, (x, y, z), (e0, e1, 0.0), a, p, u, g, b, outward, *rates)
 
 
-def rest_accelerations(at: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
+def rest_accelerations(motion: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     """Accelerations of the coordinates a and gamma of a leg at W_dot = 0."""
-    along = dot3(at.along, rate)
-    a_rest = dot3(at.axis, rate) * along - at.a * dot3(rate, rate)
-    return a_rest, at.a_dot * (2.0 * at.a * at.gamma_dot - along) / at.u
+    along = dot3(motion.along, rate)
+    a_rest = dot3(motion.axis, rate) * along - motion.a * dot3(rate, rate)
+    return a_rest, motion.a_dot * (2.0 * motion.a * motion.gamma_dot - along) / motion.u
 
 
 def actuator_acceleration(
@@ -237,11 +240,12 @@ def actuator_acceleration(
 
     The state begins with quaternion and W.
     """
-    at_rest = (
-        (at, rest_accelerations(at, triple(state[4:7])))
-        for at in leg_motions(model, state)
-    )
-    return triple(dot3(at.g, acceleration) + rest[1] for at, rest in at_rest)
+    rate = triple(state[4:7])
+    gamma_ddot = []
+    for motion in leg_motions(model, state):
+        _, gamma_rest = rest_accelerations(motion, rate)
+        gamma_ddot.append(dot3(motion.g, acceleration) + gamma_rest)
+    return triple(gamma_ddot)
 
 
 def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
@@ -250,14 +254,15 @@ def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     ixx, iyy, izz, ixy, ixz, iyz = model.star
     total = ixx * wx * wx + iyy * wy * wy + izz * wz * wz
     total = total + 2.0 * (ixy * wx * wy + ixz * wx * wz + iyz * wy * wz)
-    for at in leg_motions(model, state):
-        leg = at.leg
-        total = total + (leg.a0 + leg.a2 * (at.a * at.a)) * at.gamma_dot * at.gamma_dot
+    for motion in leg_motions(model, state):
+        leg = motion.leg
+        a_inertia = leg.a0 + leg.a2 * (motion.a * motion.a)
+        total = total + a_inertia * motion.gamma_dot * motion.gamma_dot
         if leg.ixy or leg.ixz or leg.iyz:
-            root = sqrt(at.u)
-            mixed = (leg.ixz * at.a / root - leg.ixy) * at.a_dot
-            mixed = mixed - leg.iyz * at.a * root * at.gamma_dot
-            total = total + 2.0 * mixed * at.gamma_dot
+            root = sqrt(motion.u)
+            mixed = (leg.ixz * motion.a / root - leg.ixy) * motion.a_dot
+            mixed = mixed - leg.iyz * motion.a * root * motion.gamma_dot
+            total = total + 2.0 * mixed * motion.gamma_dot
     return 0.5 * total
 
 
@@ -267,18 +272,18 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     rows = rotation_rows((x, y, z, w))
     field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
     total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
-    for at in leg_motions(model, state):
-        leg, own = at.leg, 0.0
-        for kind, spring in enumerate(leg.springs):
+    for motion in leg_motions(model, state):
+        leg, own = motion.leg, 0.0
+        for joint, spring in enumerate(leg.springs):
             if spring is not None:
-                stretch = joint_angle(at, kind) - spring.rest
+                stretch = joint_angle(motion, joint) - spring.rest
                 own = own + 0.5 * spring.stiffness * stretch * stretch
         if leg.stops is not None:
-            gamma = joint_angle(at, 0)
+            gamma = joint_angle(motion, 0)
             for depth in (positive(-gamma), positive(gamma - leg.stops.arc)):
                 own = own + 0.5 * leg.stops.stiffness * depth * depth
         if any(leg.drive) or any(leg.link):
-            first, second = _directions(at)
+            first, second = _directions(motion)
             own = own - dot3(_combine(leg.drive, *first), field)
             own = own - dot3(_combine(leg.link, *second), field)
         total = total + own
@@ -300,20 +305,20 @@ def power(
     Actuators and external moments put it in. It is the rate of kinetic plus potential
     energy. With lag the torques are the state's own.
     """
-    x, y, z, w, wx, wy, wz, *given = state
+    x, y, z, w, wx, wy, wz, *lagged = state
     rows = rotation_rows((x, y, z, w))
-    acting = torque if model.time_constant is None else given
+    acting = torque if model.time_constant is None else lagged
     total: Scalar = 0.0
-    for at, drive in zip(leg_motions(model, state), acting, strict=True):
-        total = total + drive * at.gamma_dot
-        leg, lost = at.leg, 0.0
-        for kind, friction in enumerate(leg.friction):
+    for motion, drive in zip(leg_motions(model, state), acting, strict=True):
+        total = total + drive * motion.gamma_dot
+        leg, lost = motion.leg, 0.0
+        for joint, friction in enumerate(leg.friction):
             if friction is not None:
                 lost = lost + friction_torque(
-                    friction, joint_rate(at, kind)
-                ) * joint_rate(at, kind)
+                    friction, joint_rate(motion, joint)
+                ) * joint_rate(motion, joint)
         if leg.stops is not None and leg.stops.damping:
-            gamma, speed = joint_angle(at, 0), at.gamma_dot
+            gamma, speed = joint_angle(motion, 0), motion.gamma_dot
             elastic = leg.stops._replace(damping=0.0)
             excess = stop_torque(elastic, gamma, speed) - stop_torque(
                 leg.stops, gamma, speed
@@ -338,28 +343,30 @@ def power(
 # not have is Python's 0.0, which leaves nothing behind in a traced program.
 
 
-def joint_torques(at: LegMotion, field: Triple) -> Triple:
+def joint_torques(motion: LegMotion, field: Triple) -> Triple:
     """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
-    leg = at.leg
+    leg = motion.leg
     torques = []
-    for kind in range(3):
+    for joint in range(3):
         rubbing, restoring = 0.0, 0.0
-        friction, spring = leg.friction[kind], leg.springs[kind]
+        friction, spring = leg.friction[joint], leg.springs[joint]
         if friction is not None:
-            rubbing = -friction_torque(friction, joint_rate(at, kind))
+            rubbing = -friction_torque(friction, joint_rate(motion, joint))
         if spring is not None:
-            restoring = -spring.stiffness * (joint_angle(at, kind) - spring.rest)
+            restoring = -spring.stiffness * (joint_angle(motion, joint) - spring.rest)
         torques.append(rubbing + restoring)
     at_gamma, at_mu = 0.0, 0.0
     if any(leg.drive) or any(leg.link):  # weight: moments about w_k and -r_k
-        of_drive, of_link = _directions(at)
+        of_drive, of_link = _directions(motion)
         on_link = cross3(_combine(leg.link, *of_link), field)
         on_drive = cross3(_combine(leg.drive, *of_drive), field)
         r = of_drive[0]
-        at_gamma = dot3(add(on_link, on_drive), at.axis)
+        at_gamma = dot3(add(on_link, on_drive), motion.axis)
         at_mu = -dot3(on_link, r)
     if leg.stops is not None:
-        at_gamma = at_gamma + stop_torque(leg.stops, joint_angle(at, 0), at.gamma_dot)
+        at_gamma = at_gamma + stop_torque(
+            leg.stops, joint_angle(motion, 0), motion.gamma_dot
+        )
     of_gamma, of_mu, of_beta = torques
     return of_gamma + at_gamma, of_mu + at_mu, of_beta
 
@@ -387,7 +394,7 @@ def own_torques(model: Model, rows: Rows, rate: Triple) -> OwnTorques:
             by_row = triple(by_name.get(f"R{i}{j}", 0.0) for j in (1, 2, 3))
             star = add(star, cross3(row, by_row))  # -G_i x R_i
         for k in range(3):
-            angles = (f"{kind}_{k + 1}" for kind in ("gamma", "mu", "beta"))
+            angles = (f"{joint}_{k + 1}" for joint in JOINT_NAMES)
             torques = triple(-by_name.get(name, 0.0) for name in angles)
             joints[k] = add(joints[k], torques)
     return OwnTorques(star, joints)
@@ -418,11 +425,10 @@ def _quantity(name: str, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) ->
         return dot3(rows[OMEGA.index(name)], rate)
     if name in BODY_RATE:
         return rate[BODY_RATE.index(name)]
-    kind, leg = (
-        ("gamma", "mu", "beta").index(name.partition("_")[0]),
-        legs[int(name[-1]) - 1],
-    )
-    return joint_angle(leg, kind) if name in ANGLE_NAMES else joint_rate(leg, kind)
+    angle, _, _ = name.partition("_")
+    joint = JOINT_NAMES.index(angle)
+    leg = legs[int(name[-1]) - 1]
+    return joint_angle(leg, joint) if name in ANGLE_NAMES else joint_rate(leg, joint)
 
 
 def friction_torque(friction: Friction, v: Scalar) -> Scalar:
@@ -448,35 +454,36 @@ def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar
     )
 
 
-def joint_rate(at: LegMotion, kind: int) -> Scalar:
+def joint_rate(motion: LegMotion, joint: int) -> Scalar:
     """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
-    if kind == 0:
-        return at.gamma_dot
-    return -at.a_dot / sqrt(at.u) if kind == 1 else at.beta_dot
+    if joint == 0:
+        return motion.gamma_dot
+    return -motion.a_dot / sqrt(motion.u) if joint == 1 else motion.beta_dot
 
 
-def joint_angle(at: LegMotion, kind: int) -> Scalar:
+def joint_angle(motion: LegMotion, joint: int) -> Scalar:
     """Angle of gamma (0), mu (1) or beta (2) [rad]."""
-    return atan2(*direction_of(at, kind))
+    return atan2(*direction_of(motion, joint))
 
 
-def direction_of(at: LegMotion, kind: int) -> tuple[Scalar, Scalar]:
+def direction_of(motion: LegMotion, joint: int) -> tuple[Scalar, Scalar]:
     """Sine and cosine of gamma (0), mu (1) or beta (2).
 
     Times sqrt(u) but those of mu.
     """
-    if kind == 0:
-        return dot3(at.outward, at.leg.across), dot3(at.outward, at.leg.v)
-    if kind == 1:
-        return sqrt(at.u), at.a
+    if joint == 0:
+        leg = motion.leg
+        return dot3(motion.outward, leg.across), dot3(motion.outward, leg.v)
+    if joint == 1:
+        return sqrt(motion.u), motion.a
     # r.(t x s) and r.s with s = (0, 0, 1).
-    return at.p[0] * at.along[1] - at.p[1] * at.along[0], at.p[2]
+    return motion.p[0] * motion.along[1] - motion.p[1] * motion.along[0], motion.p[2]
 
 
 def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
     """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
     root = sqrt(leg.u)
-    r = triple(part / root for part in leg.p)
+    r = triple(component / root for component in leg.p)
     return (r, cross3(leg.axis, r), leg.axis), (r, cross3(leg.along, r), leg.along)
 
 

@@ -17,6 +17,7 @@ from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
 from sst_ros.state import ZERO
 
+JOINT_NAMES = ("gamma", "mu", "beta")  # of a leg, from the base to the star
 # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
 SINGULAR_MU = 1e-6
 # farther beyond than this [rad], an actuator has not just reached the contact
@@ -26,6 +27,16 @@ GRAZING = 1e-12
 _WIDTH = 2.0
 """Of v / smoothing, that a step may pass at most. tanh has its poles at pi / 2 from the
 real axis: steps of this width converge with the order of their method."""
+_INVERSE_LANGEVIN_SERIES = (
+    3.0,
+    9 / 5,
+    297 / 175,
+    1539 / 875,
+    126117 / 67375,
+    43733439 / 21896875,
+)
+"""Taylor coefficients of y, y^3, ... y^11 in the x that solves coth x - 1/x = y
+(Itskov, Dargazany & Hoernes, Math. Mech. Solids 17 (2012) 693-701)."""
 _RESOLVED = 0.1
 """Share of the tolerance that a width exceeds: the local errors of accepted steps alone
 would leap over a narrower one, and steps would shrink without end where a joint
@@ -89,56 +100,80 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
 
     The numbers of the scene and its geometry may be columns, of many scenes at once.
     """
-    geometry, star, legs = (
-        geometry or Geometry.of(scene),
-        entries_of(scene.star.inertia),
-        [],
-    )
+    if geometry is None:
+        geometry = Geometry.of(scene)
+    star = entries_of(scene.star.inertia)
     carried: list[Star | Payload] = [scene.star]
-    damping, kinds = damping_of(scene.stroke), ("gamma", "mu", "beta")
+    damping = damping_of(scene.stroke)
     if scene.payload is not None:
         carried.append(scene.payload)
-        star = [
-            part + own for part, own in zip(star, scene.payload.entries, strict=True)
-        ]
+        pairs = zip(star, scene.payload.entries, strict=True)
+        star = [entry + payload_entry for entry, payload_entry in pairs]
+    legs = []
     for k in range(3):
-        w, v, e = (tuple(geometry.of_leg(name, k)) for name in ("w", "v", "e"))
-        bodies = scene.actuated_links[k], scene.intermediate_links[k]
-        drive_zz = entries_of(bodies[0].inertia)[2]
+        w = tuple(geometry.of_leg("w", k))
+        v = tuple(geometry.of_leg("v", k))
+        e = tuple(geometry.of_leg("e", k))
+        actuated = scene.actuated_links[k]
+        intermediate = scene.intermediate_links[k]
+        _, _, drive_zz, *_ = entries_of(actuated.inertia)
         if scene.actuators is not None:
             gear = scene.actuators.gear_ratio
             drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
-        xx, yy, zz, xy, xz, yz = entries_of(bodies[1].inertia)
-        turning = zip(star, PLACES, strict=True)
-        star = [part + xx * (float(i == j) - e[i] * e[j]) for part, (i, j) in turning]
-        drive = link = ZERO
+        xx, yy, zz, xy, xz, yz = entries_of(intermediate.inertia)
+        # Across t_k the link turns as the star: Ixx (1 - t t^T) is the star's.
+        star = [
+            entry + xx * (float(i == j) - e[i] * e[j])
+            for entry, (i, j) in zip(star, PLACES, strict=True)
+        ]
+        drive = ZERO
+        link = ZERO
         if scene.gravity is not None:
-            drive, link = (multiply(body.mass, body.centre) for body in bodies)
+            drive = multiply(actuated.mass, actuated.centre)
+            link = multiply(intermediate.mass, intermediate.centre)
         stops = None
         if scene.stroke.stiffness is not None:
-            stops = ElasticStops(
-                geometry.of_leg("arc", k), scene.stroke.stiffness, damping
+            arc = geometry.of_leg("arc", k)
+            stops = ElasticStops(arc, scene.stroke.stiffness, damping)
+        a0 = drive_zz + yy - xx
+        a2 = zz - yy + xx
+        springs = _springs_of(scene, k)
+        legs.append(
+            Leg(
+                w=w, v=v, across=cross3(w, v), e0=e[0], e1=e[1],
+                a0=a0, a2=a2, ixy=xy, ixz=xz, iyz=yz,
+                friction=_friction_of(scene), springs=springs,
+                drive=drive, link=link, stops=stops,
             )
-        friction = tuple(getattr(scene.friction, kind, None) for kind in kinds)
-        springs = (
-            [x for x in scene.springs if x.joint == f"{kind}_{k + 1}"] for kind in kinds
-        )
-        inertias = (drive_zz + yy - xx, zz - yy + xx, xy, xz, yz)
-        loads = (friction, tuple(map(_join, springs)), drive, link, stops)
-        legs.append(Leg(w, v, cross3(w, v), e[0], e[1], *inertias, *loads))
+        )  # fmt: skip
+    gravity = None if scene.gravity is None else scene.gravity.acceleration
+    moment = None if scene.moment is None else scene.moment.value
+    actuators = scene.actuators
     return Model(
         star=tuple(star),
         legs=(legs[0], legs[1], legs[2]),
-        gravity=None if scene.gravity is None else scene.gravity.acceleration,
+        gravity=gravity,
         weight=triple(
             sum(body.mass * body.centre[i] for body in carried) for i in range(3)
         ),
-        moment=None if scene.moment is None else scene.moment.value,
-        time_constant=None
-        if scene.actuators is None
-        else scene.actuators.time_constant,
+        moment=moment,
+        time_constant=None if actuators is None else actuators.time_constant,
         own_loads=tuple(map(load_constants, scene.own_loads)),
     )
+
+
+def _friction_of(scene: Any) -> tuple[Friction | None, ...]:
+    """Return the friction of gamma, mu and beta."""
+    return tuple(getattr(scene.friction, name, None) for name in JOINT_NAMES)
+
+
+def _springs_of(scene: Any, k: int) -> tuple[JointSpring | None, ...]:
+    """Return the springs of gamma, mu and beta of leg k, one a joint."""
+    springs = []
+    for name in JOINT_NAMES:
+        joint = f"{name}_{k + 1}"
+        springs.append(_join([x for x in scene.springs if x.joint == joint]))
+    return tuple(springs)
 
 
 def damping_of(stroke: Stroke) -> Any:
@@ -168,16 +203,10 @@ def damping_of(stroke: Stroke) -> Any:
 def _inverse_langevin(y: float) -> float:
     """Solve coth x - 1/x = y for x >= 0, 0 <= y < 1."""
     if y < 0.05:  # coth x - 1/x would cancel; the next term of the series is 2.1 y^13
-        coefficients = (
-            3.0,
-            9 / 5,
-            297 / 175,
-            1539 / 875,
-            126117 / 67375,
-            43733439 / 21896875,
-        )
-        return sum(c * y ** (2 * i + 1) for i, c in enumerate(coefficients))
-    low, high = 3.0 * y, 1.0 / (1.0 - y) + 3.0 * y
+        terms = enumerate(_INVERSE_LANGEVIN_SERIES)
+        return sum(coefficient * y ** (2 * i + 1) for i, coefficient in terms)
+    low = 3.0 * y
+    high = 1.0 / (1.0 - y) + 3.0 * y
     while True:  # at most some sixty bisections
         x = 0.5 * (low + high)
         if not low < x < high:
@@ -223,11 +252,13 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
 
     Infinite where there is none.
     """
-    found: dict[int, tuple[float, float]] = {}
+    ranges: dict[int, tuple[float, float]] = {}
     for limit in limits:
-        low, high = found.get(limit.joint, (-math.inf, math.inf))
-        found[limit.joint] = (limit.end, high) if limit.sign > 0.0 else (low, limit.end)
-    return [(joint, low, high) for joint, (low, high) in found.items()]
+        low, high = ranges.get(limit.joint, (-math.inf, math.inf))
+        ranges[limit.joint] = (
+            (limit.end, high) if limit.sign > 0.0 else (low, limit.end)
+        )
+    return [(joint, low, high) for joint, (low, high) in ranges.items()]
 
 
 def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
@@ -242,23 +273,22 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
         )
 
     for k in range(3):
-        mu, gamma, beta = (
-            f"serial singularity, mu_{k + 1}",
-            f"gamma_{k + 1}",
-            f"beta_{k + 1}",
-        )
-        yield Limit(f"{mu} = 0", SingularityReached, k + 3, 1.0, SINGULAR_MU)
-        yield Limit(
-            f"{mu} = pi", SingularityReached, k + 3, -1.0, math.pi - SINGULAR_MU
-        )
+        singular = f"serial singularity, mu_{k + 1}"
+        mu = k + 3
+        yield Limit(f"{singular} = 0", SingularityReached, mu, 1.0, SINGULAR_MU)
+        most = math.pi - SINGULAR_MU
+        yield Limit(f"{singular} = pi", SingularityReached, mu, -1.0, most)
         if scene.stroke.at_end == "stop":
             arc = geometry.of_leg("arc", k)
-            yield Limit(f"{gamma} < 0", StrokeExceeded, k, 1.0, 0.0)
-            yield Limit(above(gamma, arc), StrokeExceeded, k, -1.0, arc)
+            name = f"gamma_{k + 1}"
+            yield Limit(f"{name} < 0", StrokeExceeded, k, 1.0, 0.0)
+            yield Limit(above(name, arc), StrokeExceeded, k, -1.0, arc)
         if scene.workspace.at_edge == "stop":
-            most = geometry.beta_max
-            yield Limit(f"{beta} < 0", WorkspaceLeft, k + 6, 1.0, 0.0)
-            yield Limit(above(beta, most), WorkspaceLeft, k + 6, -1.0, most)
+            name = f"beta_{k + 1}"
+            beta = k + 6
+            edge = geometry.beta_max
+            yield Limit(f"{name} < 0", WorkspaceLeft, beta, 1.0, 0.0)
+            yield Limit(above(name, edge), WorkspaceLeft, beta, -1.0, edge)
 
 
 def contact_events_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
@@ -296,14 +326,14 @@ def transitions_of(scene: Any, tolerance: float) -> tuple[Transition, ...]:
     edge = 0.5 * math.log(max(2.0 / tolerance, 1.0))
     if scene.friction is None or edge == 0.0:
         return ()
-    kinds = scene.friction.gamma, scene.friction.mu, scene.friction.beta
+    frictions = scene.friction.gamma, scene.friction.mu, scene.friction.beta
     return tuple(
         Transition(
             9 + 3 * place + leg,
             edge * friction.smoothing,
             _WIDTH * friction.smoothing,
         )
-        for place, friction in enumerate(kinds)
+        for place, friction in enumerate(frictions)
         if friction is not None
         and (friction.coulomb or friction.static)
         and _WIDTH * friction.smoothing >= _RESOLVED * tolerance

@@ -85,8 +85,9 @@ class MotionTable(Explained, ReadOnly):
         for name in names:
             array = getattr(self, name)
             if name in QUANTITIES:
-                parts = enumerate(DIMENSIONS[QUANTITIES[name][1]])
-                columns |= {f"{name}_{part}": array[..., i] for i, part in parts}
+                components = enumerate(DIMENSIONS[QUANTITIES[name][1]])
+                for i, component in components:
+                    columns[f"{name}_{component}"] = array[..., i]
             else:
                 columns[name] = array
         return columns
@@ -104,10 +105,11 @@ class MotionTable(Explained, ReadOnly):
 
         Units are in its `attrs`.
         """
-        more = self._of_each()
-        columns = {name: values for name, (values, _) in more.items()} | self.columns()
+        scenario_columns = self._of_each()
+        columns = {name: values for name, (values, _) in scenario_columns.items()}
+        columns |= self.columns()
         table: pd.DataFrame = require("pandas").DataFrame(columns)
-        units = {name: unit for name, (_, unit) in more.items() if unit}
+        units = {name: unit for name, (_, unit) in scenario_columns.items() if unit}
         table.attrs = {"units": MOTION_UNITS | units, "scene": self.scene.name}
         table.index.name = None if self._axes == ("time",) else self._axes[-1]
         return table
@@ -130,10 +132,10 @@ class MotionTable(Explained, ReadOnly):
         else:
             coordinates = {"time": ("time", self.t, time)}
         about = {"scene": self.scene.name} | self._of_run()
-        found: xr.Dataset = require("xarray").Dataset(
+        dataset: xr.Dataset = require("xarray").Dataset(
             arrays, coordinates | DIMENSIONS, about
         )
-        return found
+        return dataset
 
     def __len__(self) -> int:
         return int(self.t.shape[-1])

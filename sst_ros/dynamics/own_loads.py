@@ -71,7 +71,8 @@ def load_constants(load: FormulaLoad) -> LoadConstants:
     formula = LoadFormula(
         load.name, names, terms, load.potential, tuple(load.moment), in_star
     )
-    return LoadConstants(formula, tuple(one.value for one in load.parameters))
+    values = tuple(parameter.value for parameter in load.parameters)
+    return LoadConstants(formula, values)
 
 
 class LoadProgram(NamedTuple):
@@ -97,37 +98,37 @@ def load_program(formula: LoadFormula) -> LoadProgram:
     inputs = (*quantities, *formula.parameters)
 
     def run(*values: Any) -> list[Any]:
-        known = dict(zip(inputs, values, strict=True)) | {"pi": math.pi}
+        variables = dict(zip(inputs, values, strict=True)) | {"pi": math.pi}
         for name, text in formula.terms:
-            known[name] = _evaluate(parse(text), known)
-        return [_evaluate(parse(text), known) for text in formula.outputs]
+            variables[name] = _evaluate(parse(text), variables)
+        return [_evaluate(parse(text), variables) for text in formula.outputs]
 
     by = () if formula.potential is None else quantities
     try:
         return LoadProgram(quantities, trace(run, inputs, by))
     except (ArithmeticError, ValueError) as error:
-        allowed = f"must have a value: {error}"
-        raise refusal("own_loads", formula.name, texts, allowed) from None
+        requirement = f"must have a value: {error}"
+        raise refusal("own_loads", formula.name, texts, requirement) from None
 
 
-def _evaluate(node: ast.expr, known: Mapping[str, Any]) -> Any:
+def _evaluate(node: ast.expr, variables: Mapping[str, Any]) -> Any:
     """Compute a part of a formula, which has been checked, on numbers of any kind."""
     if isinstance(node, ast.Constant):
         return float(node.value)  # type: ignore[arg-type]
     if isinstance(node, ast.Name):
-        return known[node.id]
+        return variables[node.id]
     if isinstance(node, ast.UnaryOp):
-        value = _evaluate(node.operand, known)
+        value = _evaluate(node.operand, variables)
         return -value if isinstance(node.op, ast.USub) else value
     if isinstance(node, ast.Call):
         assert isinstance(node.func, ast.Name)
-        arguments = [_evaluate(argument, known) for argument in node.args]
+        arguments = [_evaluate(argument, variables) for argument in node.args]
         return _CALL_FUNCTIONS[node.func.id](*arguments)
     assert isinstance(node, ast.BinOp)
-    left = _evaluate(node.left, known)
+    left = _evaluate(node.left, variables)
     if isinstance(node.op, ast.Pow):
         return _raise(left, power_of(node) or 1)
-    return _OPERATOR_FUNCTIONS[type(node.op)](left, _evaluate(node.right, known))
+    return _OPERATOR_FUNCTIONS[type(node.op)](left, _evaluate(node.right, variables))
 
 
 def _raise(base: Any, power: int) -> Any:
@@ -226,32 +227,32 @@ class Symbol:
     def __init__(self, value: Any) -> None:
         self.value = value
 
-    def _with(self, function: Callable[[Any, Any], Any], other: Any) -> Any:
-        if isinstance(other, np.ndarray):
+    def _with(self, function: Callable[[Any, Any], Any], operand: Any) -> Any:
+        if isinstance(operand, np.ndarray):
             return NotImplemented
-        return Symbol(function(self.value, _value_of(other)))
+        return Symbol(function(self.value, _value_of(operand)))
 
-    def __add__(self, other: Any) -> Any:
-        return self._with(operator.add, other)
+    def __add__(self, operand: Any) -> Any:
+        return self._with(operator.add, operand)
 
     __radd__ = __add__
 
-    def __sub__(self, other: Any) -> Any:
-        return self._with(operator.sub, other)
+    def __sub__(self, operand: Any) -> Any:
+        return self._with(operator.sub, operand)
 
-    def __rsub__(self, other: Any) -> Any:
-        return self._with(lambda mine, theirs: theirs - mine, other)
+    def __rsub__(self, operand: Any) -> Any:
+        return self._with(lambda mine, theirs: theirs - mine, operand)
 
-    def __mul__(self, other: Any) -> Any:
-        return self._with(operator.mul, other)
+    def __mul__(self, operand: Any) -> Any:
+        return self._with(operator.mul, operand)
 
     __rmul__ = __mul__
 
-    def __truediv__(self, other: Any) -> Any:
-        return self._with(operator.truediv, other)
+    def __truediv__(self, operand: Any) -> Any:
+        return self._with(operator.truediv, operand)
 
-    def __rtruediv__(self, other: Any) -> Any:
-        return self._with(lambda mine, theirs: theirs / mine, other)
+    def __rtruediv__(self, operand: Any) -> Any:
+        return self._with(lambda mine, theirs: theirs / mine, operand)
 
     def __pow__(self, power: Any) -> Symbol:
         if power == 0.5:
@@ -388,20 +389,24 @@ def own_load(
             formulas can, or a formula is none.
 
     """
-    given = dict(parameters or {})
-    one = (potential is None) != (moment is None)
-    refuse_unless("own_load", ("potential, moment", None, one, "give one of them"))
+    parameter_values = dict(parameters or {})
+    exactly_one = (potential is None) != (moment is None)
+    refuse_unless(
+        "own_load", ("potential, moment", None, exactly_one, "give one of them")
+    )
     document: dict[str, Any] = {"name": name, "frame": frame}
     document["parameters"] = tuple(
-        LoadParameter(name=key, value=x) for key, x in given.items()
+        LoadParameter(name=key, value=x) for key, x in parameter_values.items()
     )
     if callable(potential):
         document["terms"], (energy,) = _write(
-            potential, given, POSE_NAMES, 1, "potential"
+            potential, parameter_values, POSE_NAMES, 1, "potential"
         )
         document["potential"] = energy
     elif callable(moment):
-        document["terms"], texts = _write(moment, given, STATE_NAMES, 3, "moment")
+        document["terms"], texts = _write(
+            moment, parameter_values, STATE_NAMES, 3, "moment"
+        )
         document["moment"] = texts
     elif potential is not None:
         document["potential"] = potential
@@ -435,8 +440,8 @@ def _write(
     try:
         program = trace(run, inputs)
     except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        allowed = f"must be a function that formulas can say: {error}"
-        raise refusal("own_load", key, function, allowed) from None
+        requirement = f"must be a function that formulas can say: {error}"
+        raise refusal("own_load", key, function, requirement) from None
     return write_formulas(program)
 
 
@@ -456,25 +461,24 @@ def write_formulas(
     prefix = "s"
     while any(name.startswith(prefix) for name in program.inputs):
         prefix += "_"
-    words = list(program.inputs)
+    value_texts = list(program.inputs)
     terms: dict[str, str] = {}
 
-    def word(operand: float | int) -> str:
+    def operand_text(operand: float | int) -> str:
         if isinstance(operand, int):
-            return words[operand]
+            return value_texts[operand]
         return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
     for index, (operation, operands) in enumerate(program.steps, start=first):
         assert isinstance(operation, str)  # no routine: a load has none
-        text = _FORMS.get(operation, operation + "({})").format(*map(word, operands))
-        if operation == "atan2":
-            text = "atan2({}, {})".format(*map(word, operands))
+        form = _FORMS.get(operation, operation + "({})")
+        text = form.format(*map(operand_text, operands))
         if uses[index] > 1 or len(text) > _LONG:
             name = f"{prefix}{len(terms) + 1}"
             terms[name] = text
             text = name
-        words.append(text)
-    return tuple(terms.items()), tuple(map(word, program.outputs))
+        value_texts.append(text)
+    return tuple(terms.items()), tuple(map(operand_text, program.outputs))
 
 
 _LONG = 200  # characters after which a formula continues in another term
@@ -484,4 +488,5 @@ _FORMS = {
     "mul": "({} * {})",
     "div": "({} / {})",
     "neg": "(-{})",
+    "atan2": "atan2({}, {})",
 }

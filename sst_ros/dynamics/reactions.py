@@ -81,9 +81,9 @@ SIZES = {
 }  # fmt: skip
 """What a bearing and a motor are chosen by, with units."""
 REACTION_UNITS = {
-    f"{kind}_{name}_{leg}_{axis}": unit
+    f"{quantity}_{name}_{leg}_{axis}": unit
     for name in LINK_JOINTS
-    for kind, unit in (("force", "N"), ("moment", "N m"))
+    for quantity, unit in (("force", "N"), ("moment", "N m"))
     for leg in (1, 2, 3)
     for axis in "xyz"
 }
@@ -172,8 +172,8 @@ class Reactions(Explained):
         """Return a column a number by the names of REACTION_UNITS."""
         columns = {}
         for key in REACTION_UNITS:
-            kind, name, leg, axis = key.split("_")
-            values = getattr(getattr(self, name), kind)
+            quantity, name, leg, axis = key.split("_")
+            values = getattr(getattr(self, name), quantity)
             columns[key] = values[..., int(leg) - 1, "xyz".index(axis)]
         return columns
 
@@ -226,9 +226,10 @@ def load_figures(t: Array, values: Array) -> LoadFigures:
     )
     when = np.take_along_axis(times, row[None], axis=0)[0]
     span = times[-1] - times[0]
-    parts = np.diff(times, axis=0)
+    intervals = np.diff(times, axis=0)
     first, last = values[:-1], values[1:]
-    squares = np.sum(parts * (first * first + first * last + last * last), axis=0) / 3.0
+    integrand = first * first + first * last + last * last
+    squares = np.sum(intervals * integrand, axis=0) / 3.0
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(span > 0.0, squares / span, size[0] ** 2)
     return LoadFigures(peak, when, np.sqrt(mean))
@@ -303,8 +304,9 @@ class ScenarioReactions:
         names = (*MOTION, *TORQUE_SYMBOLS, *(f"p{i}" for i in range(len(columns))))
 
         def run(*inputs: Any) -> list[Any]:
-            given = map(mark_present, inputs[10:])
-            own_scene, own_model = rebuild(tree, dict(zip(columns, given, strict=True)))
+            marked = map(mark_present, inputs[10:])
+            symbols = dict(zip(columns, marked, strict=True))
+            own_scene, own_model = rebuild(tree, symbols)
             return _flatten(
                 _legs(own_scene, own_model, inputs[:7], triple(inputs[7:10]))
             )
@@ -333,11 +335,11 @@ def _legs(
     return _solve(scene, model, state, triple(slope[4:7]), torque)
 
 
-def _flatten(parts: Any) -> list[Scalar]:
+def _flatten(tree: Any) -> list[Scalar]:
     """List the numbers of nested tuples in order."""
-    if isinstance(parts, (list, tuple)):
-        return [number for part in parts for number in _flatten(part)]
-    return [parts]
+    if isinstance(tree, (list, tuple)):
+        return [number for branch in tree for number in _flatten(branch)]
+    return [tree]
 
 
 def _collect(t: Array, numbers: Sequence[Scalar], rows: Rows) -> Reactions:
@@ -389,20 +391,20 @@ def _solve(
     own = kernel.own_torques(model, rows, rate) if model.own_loads else None
     star = _change_of_star(scene, model, field, rate, acceleration)
     legs = []
-    for k, (at, drive) in enumerate(zip(motions, torque, strict=True)):
-        loads = _joint_loads(at)
+    for k, (motion, drive) in enumerate(zip(motions, torque, strict=True)):
+        loads = _joint_loads(motion)
         if own is not None:
             loads = add(loads, own.joints[k])
-        legs.append(_Leg.of(scene, k, at, field, rate, acceleration, drive, loads))
+        legs.append(_Leg.of(scene, k, motion, field, rate, acceleration, drive, loads))
     # Least sum of squares of the forces x, x + b and x + b + a of each leg, whose x
     # make up the star's: 3 x + 2 b + a is the same in all legs.
     spread = [add(multiply(2.0, leg.link.force), leg.drive.force) for leg in legs]
     mean = multiply(1.0 / 3.0, add(add(spread[0], spread[1]), spread[2]))
-    found = []
+    reactions = []
     for leg, own_spread in zip(legs, spread, strict=True):
         share = add(star.force, _subtract(mean, own_spread))
-        found.append(leg.express(multiply(1.0 / 3.0, share)))
-    return found
+        reactions.append(leg.express(multiply(1.0 / 3.0, share)))
+    return reactions
 
 
 class _Leg(NamedTuple):
@@ -419,7 +421,7 @@ class _Leg(NamedTuple):
         cls,
         scene: Any,
         k: int,
-        at: LegMotion,
+        motion: LegMotion,
         field: Triple,
         rate: Triple,
         acceleration: Triple,
@@ -427,19 +429,22 @@ class _Leg(NamedTuple):
         loads: Triple,
     ) -> _Leg:
         """Solve the moments of leg k under its actuator's torque and joint loads."""
-        root = sqrt(at.u)  # c_k = (r x t).w = sin(mu_k)
-        r, t, w = triple(part / root for part in at.p), at.along, at.axis
+        root = sqrt(motion.u)  # c_k = (r x t).w = sin(mu_k)
+        r = triple(component / root for component in motion.p)
+        t = motion.along
+        w = motion.axis
         across = cross3(w, r)
         first, second = (r, across, w), (r, cross3(t, r), t)
-        gamma_ddot = dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1]
-        mu_dot = -at.a_dot / root
+        _, gamma_rest = kernel.rest_accelerations(motion, rate)
+        gamma_ddot = dot3(motion.g, acceleration) + gamma_rest
+        mu_dot = -motion.a_dot / root
         turning = cross3(rate, t)
-        products = at.gamma_dot * mu_dot + at.beta_dot * dot3(across, turning)
+        products = motion.gamma_dot * mu_dot + motion.beta_dot * dot3(across, turning)
         beta_ddot = -(dot3(across, acceleration) + products) / root  # Eq. 46
         # omega of the star is that of the intermediate link - t beta_dot, and t turns
         # with it.
-        slide = add(multiply(beta_ddot, t), multiply(at.beta_dot, turning))
-        link_rate = add(rate, multiply(at.beta_dot, t))
+        slide = add(multiply(beta_ddot, t), multiply(motion.beta_dot, turning))
+        link_rate = add(rate, multiply(motion.beta_dot, t))
         link = scene.intermediate_links[k]
         link_change = _change_of(
             entries_of(link.inertia), link.mass, link.centre, second, field,
@@ -452,7 +457,7 @@ class _Leg(NamedTuple):
             inertia[2] = inertia[2] + gear * gear * scene.actuators.rotor_inertia
         drive_change = _change_of(
             inertia, drive.mass, drive.centre, first, field,
-            multiply(at.gamma_dot, w), multiply(gamma_ddot, w),
+            multiply(motion.gamma_dot, w), multiply(gamma_ddot, w),
         )  # fmt: skip
         at_gamma, at_mu, at_beta = loads
         needs = link_change.moment
@@ -460,7 +465,7 @@ class _Leg(NamedTuple):
         along_r = -at_mu - dot3(r, needs)
         along_w = torque + at_gamma - dot3(w, add(needs, drive_change.moment))
         normal = cross3(r, t)
-        along_normal = (along_w - at.a * along_t) / root
+        along_normal = (along_w - motion.a * along_t) / root
         moment = add(multiply(along_r, r), multiply(along_normal, normal))
         moment = add(moment, multiply(along_t, t))
         return cls(first, second, drive_change, link_change, moment)
@@ -484,12 +489,12 @@ class _Leg(NamedTuple):
         )
 
 
-def _joint_loads(at: LegMotion) -> Triple:
+def _joint_loads(motion: LegMotion) -> Triple:
     """Torques of friction, springs and stops at gamma, mu and beta [N m].
 
     Weights are left out.
     """
-    weightless = at._replace(leg=at.leg._replace(drive=ZERO, link=ZERO))
+    weightless = motion._replace(leg=motion.leg._replace(drive=ZERO, link=ZERO))
     return kernel.joint_torques(weightless, ZERO)
 
 
@@ -568,11 +573,11 @@ def _length(vectors: Array) -> Array:
     return np.asarray(np.sqrt(np.sum(vectors * vectors, axis=-1)))
 
 
-def _stack(t: Array, parts: Any) -> Array:
+def _stack(t: Array, tree: Any) -> Array:
     """Stack nested triples of columns behind the axes of t; the result is read-only."""
-    if isinstance(parts, (list, tuple)):
-        array = np.stack([_stack(t, part) for part in parts], axis=t.ndim)
+    if isinstance(tree, (list, tuple)):
+        array = np.stack([_stack(t, branch) for branch in tree], axis=t.ndim)
     else:
-        array = np.array(np.broadcast_to(parts, t.shape), dtype=float)
+        array = np.array(np.broadcast_to(tree, t.shape), dtype=float)
     array.setflags(write=False)
     return array

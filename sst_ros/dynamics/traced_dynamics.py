@@ -378,16 +378,16 @@ def limit_distances(
     legs = list(kernel.leg_motions(model, state))
     distances, rates = [], []
     for limit, (cosine, sine) in zip(limits, ends, strict=True):
-        kind, number = divmod(limit.joint, LEGS)
+        joint, number = divmod(limit.joint, LEGS)
         leg = legs[number]
-        if kind == 1:  # sin(mu)^2 - sin(end)^2
+        if joint == 1:  # sin(mu)^2 - sin(end)^2
             distance = leg.u - sine * sine
             rate = -2.0 * leg.a * leg.a_dot
         else:  # sqrt(u) sin(sign * (angle - end))
-            across, along = kernel.direction_of(leg, kind)
+            across, along = kernel.direction_of(leg, joint)
             distance = limit.sign * (across * cosine - along * sine)
             turned = along * cosine + across * sine
-            rate = limit.sign * turned * kernel.joint_rate(leg, kind)
+            rate = limit.sign * turned * kernel.joint_rate(leg, joint)
             rate = rate - distance * leg.a * leg.a_dot / leg.u
         distances.append(distance)
         rates.append(rate)
@@ -445,9 +445,9 @@ class ParametricModel:
         Refused are numbers that differ and are fixed in this model, and actuators that
         cannot give the torques of the profile.
         """
-        tree, geometries, which = self._constants_of(scenarios)
+        tree, geometries, geometry_index = self._constants_of(scenarios)
         numbers = leaves(tree)
-        inputs = np.empty((len(self._varied), len(which)))
+        inputs = np.empty((len(self._varied), len(geometry_index)))
         for row, place in zip(inputs, self._varied, strict=True):
             row[:] = numbers[place]
             if place[-1] == "static":
@@ -459,19 +459,21 @@ class ParametricModel:
                 # of a spring without stiffness any will do
                 np.nan_to_num(row, copy=False)
         torque_limit = getattr(scenarios.columns().actuators, "torque_limit", None)
-        limit = np.full(len(which), np.inf if torque_limit is None else torque_limit)
+        if torque_limit is None:
+            torque_limit = np.inf
+        limit = np.full(len(geometry_index), torque_limit)
         limit[limit == 0.0] = np.inf  # of actuators that are left out
         all_lag = not np.any(tree.model.time_constant == 0.0)
-        allowed = "must be > 0 [s] in every scenario, or in none"
-        checks: list[Check] = [("actuators.time_constant", 0.0, all_lag, allowed)]
+        requirement = "must be > 0 [s] in every scenario, or in none"
+        checks: list[Check] = [("actuators.time_constant", 0.0, all_lag, requirement)]
         for place, fixed in self._fixed.items():
             is_fixed = bool(np.all(numbers[place] == fixed))
-            allowed = f"must be {fixed} in all scenarios of this model"
-            checks.append((str(place), numbers[place], is_fixed, allowed))
+            requirement = f"must be {fixed} in all scenarios of this model"
+            checks.append((str(place), numbers[place], is_fixed, requirement))
         if tree.torque is not None:
             checks.append(_check_limit(scenarios, tree.torque, limit))
         refuse_unless(self.scene.name, *checks)
-        return ParameterColumns(inputs, geometries, which, limit)
+        return ParameterColumns(inputs, geometries, geometry_index, limit)
 
     @cached_property
     def program(self) -> Program:
@@ -541,8 +543,8 @@ class ParametricModel:
 
         Geometries, and that of each row.
         """
-        geometries, which = Geometry.of_scenarios(scenarios)
-        geometry = geometries.of_rows(which)
+        geometries, geometry_index = Geometry.of_scenarios(scenarios)
+        geometry = geometries.of_rows(geometry_index)
         columns = scenarios.columns()
         limits = limits_of(self.scene, geometry)
         ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
@@ -551,7 +553,7 @@ class ParametricModel:
         ):  # 0/0: the rest of springs without stiffness
             model = kernel.model_of(columns, geometry)
         torque = columns.torque if self.profile else None
-        return Constants(model, ends, torque), geometries, which
+        return Constants(model, ends, torque), geometries, geometry_index
 
 
 def _check_limit(scenarios: Scenarios, torque: SineTorque, limit: Array) -> Check:
@@ -565,8 +567,8 @@ def _check_limit(scenarios: Scenarios, torque: SineTorque, limit: Array) -> Chec
     key = "actuators.torque_limit"
     if scenarios.count:
         key = f"scenario {row}: {key}"
-    allowed = f"must not be less than the amplitude {largest[row]} of the profile"
-    return key, float(limits[row]), bool(largest[row] <= limits[row]), allowed
+    requirement = f"must not be less than the amplitude {largest[row]} of the profile"
+    return key, float(limits[row]), bool(largest[row] <= limits[row]), requirement
 
 
 def _make_model(scenarios: Scenarios, profile: bool) -> ParametricModel:

@@ -134,13 +134,13 @@ class VariationalEquations:
             }
         )
         state, slopes = self._start(scene)
-        found = self.integrate(state, slopes, t, values, scene=scene)
-        if found is None:
-            allowed = "leave no motion to the last time"
+        solution = self.integrate(state, slopes, t, values, scene=scene)
+        if solution is None:
+            requirement = "leave no motion to the last time"
             raise refusal(
-                self._caller, _argument(self._caller), values.tolist(), allowed
+                self._caller, _argument(self._caller), values.tolist(), requirement
             )
-        return found
+        return solution
 
     def integrate(
         self,
@@ -264,10 +264,10 @@ class VariationalEquations:
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
         """Return the initial state, and derivatives by parameters and torques."""
-        more = len(_numbers(self._torque)) if self._by_torque else 0
+        torque_count = len(_numbers(self._torque)) if self._by_torque else 0
         state = np.zeros(len(Dynamics.of(scene).state))
         state[:7] = initial_state(scene, self._geometry)
-        slopes = np.zeros((len(state), len(self.names) + more))
+        slopes = np.zeros((len(state), len(self.names) + torque_count))
         own = [i for i, name in enumerate(self.names) if name.startswith("initial")]
         shaped = [i for i, name in enumerate(self.names) if name.startswith(GEOMETRY)]
         if own or shaped:
@@ -322,15 +322,15 @@ def refuse_other_numbers(scene: Scene, names: Sequence[str], caller: str) -> Non
     Only `simulate` differentiates by the geometry.
     """
     for name in names:
-        allowed = ""
+        requirement = ""
         if name.startswith(GEOMETRY) and caller != "simulate":
-            allowed = "is geometry, which is taken as known"
+            requirement = "is geometry, which is taken as known"
         elif name.startswith(OUTSIDE_PARAMETERS):
-            allowed = "is no number of the equations of motion"
+            requirement = "is no number of the equations of motion"
         elif find_number(scene, name) is None:
-            allowed = "must be the key of a number that the scene has"
-        if allowed:
-            raise refusal(caller, _argument(caller), name, allowed)
+            requirement = "must be the key of a number that the scene has"
+        if requirement:
+            raise refusal(caller, _argument(caller), name, requirement)
 
 
 def _argument(caller: str) -> str:
@@ -373,7 +373,7 @@ class _TracedAxes(NamedTuple):
 
 def _unit(vector: Triple) -> Triple:
     length = sqrt(dot3(vector, vector))
-    return triple(part / length for part in vector)
+    return triple(component / length for component in vector)
 
 
 def _open_model(scene: Scene, symbols: dict[str, Any]) -> Any:
@@ -449,17 +449,17 @@ def _differentiate_torque(
 
         return sine
     if isinstance(torque, TorqueTable):
-        held, middle = np.zeros((3, len(torque.times), 3)), 0.5 * (begin + end)
-        held[:, np.searchsorted(torque.times, middle) - 1] = unit * (
-            middle > torque.times[0]
-        )
-        return lambda time: held.reshape(3, -1)
+        middle = 0.5 * (begin + end)
+        row = np.searchsorted(torque.times, middle) - 1  # of the table, held until end
+        selection = np.zeros((3, len(torque.times), 3))
+        selection[:, row] = unit * (middle > torque.times[0])
+        return lambda time: selection.reshape(3, -1)
     if isinstance(torque, PolynomialTorque):
-        here = int(np.searchsorted(torque.x, 0.5 * (begin + end))) - 1
-        acting = np.multiply.outer(unit, np.arange(torque.c.shape[1]) == here)
+        piece_index = int(np.searchsorted(torque.x, 0.5 * (begin + end))) - 1
+        acting = np.multiply.outer(unit, np.arange(torque.c.shape[1]) == piece_index)
 
         def polynomial(time: float) -> Array:
-            powers = (time - torque.x[here]) ** np.arange(len(torque.c))[::-1]
+            powers = (time - torque.x[piece_index]) ** np.arange(len(torque.c))[::-1]
             # By torque; power, piece and component of a coefficient.
             return np.asarray(np.einsum("p,tci->tpic", powers, acting)).reshape(3, -1)
 
@@ -527,21 +527,24 @@ class Sensitivities:
             )
             for name, own in keys.items()
         }
-        by_torque, allowed = OWN_TORQUE in keys, ""
+        by_torque = OWN_TORQUE in keys
+        requirement = ""
         if torque.feedback or isinstance(torque, LostTorque):
-            allowed = (
+            requirement = (
                 "need torques that are known over time, not a function of the state"
             )
         elif by_torque and isinstance(torque, FunctionTorque):
-            allowed = "torque needs three numbers or a profile, not a function"
-        if allowed:
-            raise refusal("simulate", "sensitivities", list(keys), allowed)
+            requirement = "torque needs three numbers or a profile, not a function"
+        if requirement:
+            raise refusal("simulate", "sensitivities", list(keys), requirement)
         self._equations = VariationalEquations(scene, flat, torque, by_torque=by_torque)
-        self._given = np.array([find_number(scene, name) for name in flat], dtype=float)
+        self._values = np.array(
+            [find_number(scene, name) for name in flat], dtype=float
+        )
 
     def at(self, t: Array) -> dict[str, Sensitivity]:
         """Return sensitivities by parameter name at ascending times [s] >= 0, (n,)."""
-        states, slopes = self._equations.run(self._given, t)
+        states, slopes = self._equations.run(self._values, t)
         motion, slopes = states[:, :7].T, slopes[:, :7]
         turn = np.array(
             [quaternion_rate(tuple(motion[:4]), tuple(row)) for row in np.eye(3)]
@@ -553,9 +556,13 @@ class Sensitivities:
         rates[..., : len(by_geometry)] += np.moveaxis(by_geometry, (0, 2), (2, 0))
         # quaternion_rate(q, .) has orthogonal columns of length abs(q) / 2.
         rotation = 4.0 * np.einsum("cqn,nqp->ncp", turn, slopes[:, :4])
-        whole = Sensitivity(rates[:, :3], rates[:, 3:], rotation, slopes[:, 4:])
+        by_all_parameters = Sensitivity(
+            rates[:, :3], rates[:, 3:], rotation, slopes[:, 4:]
+        )
         return {
-            name: Sensitivity(*(freeze(array[..., columns]) for array in whole))
+            name: Sensitivity(
+                *(freeze(array[..., columns]) for array in by_all_parameters)
+            )
             for name, columns in self._columns.items()
         }
 
@@ -569,9 +576,9 @@ def list_numbers(scene: Scene, name: str) -> list[str]:
         fields = list(find_fields(scene, name, components=True))
     except ValueError:
         return [name]
-    found = []
+    keys = []
     for place, value, _ in fields:
         section = isinstance(value, Section)
         below = leaves(value) if section else np.ndindex(np.shape(value))
-        found += [key_of((*place, *rest)) for rest in below]
-    return found
+        keys += [key_of((*place, *inner_place)) for inner_place in below]
+    return keys

@@ -105,15 +105,15 @@ def advance(
     """
     begin = np.array(start, dtype=float)
     goal = np.array(end, dtype=float)
-    here = np.array(rotation, dtype=float)
+    current = np.array(rotation, dtype=float)
     gamma = begin
     length = float(np.linalg.norm(goal - begin))
     travelled = 0.0
     for _ in range(MOST_STEPS):
-        slope = _slope(geometry, gamma, here)
+        slope = _slope(geometry, gamma, current)
         sigma = float(_least_singular(slope))
         if travelled >= length:
-            return here
+            return current
         if sigma < LEAST_SIGMA:
             break
         step = SAFE_STEP * sigma * sigma
@@ -121,13 +121,13 @@ def advance(
         following = goal
         if travelled < length:
             following = begin + (travelled / length) * (goal - begin)
-        moved = _newton(geometry, following, here)
+        moved = _newton(geometry, following, current)
         # The theorem speaks of a ball about R; a result beyond it would be another
         # assembly.
-        if np.linalg.norm(moved - here) > SQRT2 * (sigma - step) / 2.0:
+        if np.linalg.norm(moved - current) > SQRT2 * (sigma - step) / 2.0:
             break
-        gamma, here = following, moved
-    raise BranchEnds(sigma, row, gamma, here, slope)
+        gamma, current = following, moved
+    raise BranchEnds(sigma, row, gamma, current, slope)
 
 
 def _least_singular(matrices: Array) -> Array:

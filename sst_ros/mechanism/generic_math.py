@@ -22,12 +22,17 @@ Symmetric = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 ARRAYS = (np.ndarray, np.generic, complex)
 
 
-def _function(name: str) -> Callable[[Any], Any]:
+def _function_of(name: str) -> Callable[[Any], Any]:
+    """Return a function of one number: that of `math`, or of the number's own kind."""
     of_float: Callable[[float], float] = getattr(math, name)
-    return lambda x: of_float(x) if type(x) is float else _other(name, x)
+    return lambda x: of_float(x) if type(x) is float else _apply_by_kind(name, x)
 
 
-sqrt, exp, log, sin, cos = map(_function, ("sqrt", "exp", "log", "sin", "cos"))
+sqrt = _function_of("sqrt")
+exp = _function_of("exp")
+log = _function_of("log")
+sin = _function_of("sin")
+cos = _function_of("cos")
 
 
 def positive(x: Any) -> Any:
@@ -79,7 +84,7 @@ def atan2(y: Any, x: Any) -> Any:
         angle = np.arctan2(np.real(y), np.real(x))
         cosine, sine = np.cos(angle), np.sin(angle)
         return angle + np.arctan((y * cosine - x * sine) / (x * cosine + y * sine))
-    return _other("atan2", y, x)
+    return _apply_by_kind("atan2", y, x)
 
 
 LN_2 = (float.fromhex("0x1.62e42fefa2p-1"), float.fromhex("0x1.9ef35793c7673p-41"))
@@ -101,7 +106,7 @@ _TANH_IS_ONE = 22.0
 
 def tanh(x: Any) -> Any:
     """Hyperbolic tangent; of floats by `tanh_steps`."""
-    return tanh_steps(x) if type(x) is float else _other("tanh", x)
+    return tanh_steps(x) if type(x) is float else _apply_by_kind("tanh", x)
 
 
 def tanh_steps(x: Scalar) -> Scalar:
@@ -118,8 +123,8 @@ def tanh_steps(x: Scalar) -> Scalar:
     """
     size = absolute(x)
     exponent = -2.0 * select(size - _TANH_IS_ONE, _TANH_IS_ONE, size)
-    whole = (exponent * (1.0 / math.log(2.0)) + TO_WHOLE) - TO_WHOLE
-    r = (exponent - whole * LN_2[0]) - whole * LN_2[1]
+    k = (exponent * (1.0 / math.log(2.0)) + TO_WHOLE) - TO_WHOLE
+    r = (exponent - k * LN_2[0]) - k * LN_2[1]
     square = r * r
     fourth = square * square
     # Pairs of pairs: half of the operations do not wait for each other.
@@ -128,7 +133,7 @@ def tanh_steps(x: Scalar) -> Scalar:
         c0, c1, c2, c3 = _EXPM1_SERIES[first : first + 4]
         sums.append((c0 + c1 * r) + square * (c2 + c3 * r))
     series = (sums[0] + fourth * sums[1]) + (fourth * fourth) * sums[2]
-    scale = power_of_two(whole)
+    scale = power_of_two(k)
     t = scale * (r + square * series) + (scale - 1.0)
     negative = t / (t + 2.0)
     return select(x, -negative, negative)
@@ -141,7 +146,8 @@ def power_of_two(k: Scalar) -> Scalar:
     return k.apply("power_of_two")
 
 
-def _other(name: str, *arguments: Any) -> Any:
+def _apply_by_kind(name: str, *arguments: Any) -> Any:
+    """Apply a function to traced expressions, NumPy's numbers or those of mpmath."""
     first = arguments[0]
     if hasattr(first, "apply"):
         return first.apply(name)

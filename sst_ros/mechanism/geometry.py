@@ -93,8 +93,8 @@ class Geometry(Explained):
         fits = shape[-2:] == (3, 3) and alpha_shape == shape[:-1]
         fits = fits and beta_shape in ((), shape[:-2])
         shapes = (shape, alpha_shape, beta_shape)
-        allowed = "must have the shapes (3, 3), (3,) and ()"
-        refuse_unless("geometry", ("v, alpha, beta_max", shapes, fits, allowed))
+        requirement = "must have the shapes (3, 3), (3,) and ()"
+        refuse_unless("geometry", ("v, alpha, beta_max", shapes, fits, requirement))
         directions /= np.linalg.norm(directions, axis=-1)[..., None]
         following = np.roll(directions, -1, axis=-2)
         normals = np.cross(directions, following)
@@ -252,18 +252,18 @@ def unwrap_zyz(angles: ArrayLike) -> Array:
     return result
 
 
-def _nearest_form(angles: Array, near: Array) -> Array:
+def _nearest_form(angles: Array, reference: Array) -> Array:
     """Return the form of ZYZ angles that is nearest to others, shape (3,) each."""
     theta, phi, psi = angles
     half_turn = np.pi
     if phi in (0.0, np.pi):
         half_turn = 0.0
-        shift = near[0] - theta
-        theta = near[0]
+        shift = reference[0] - theta
+        theta = reference[0]
         psi = psi + shift if phi else psi - shift
     forms = np.array([[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]])
-    forms += 2.0 * np.pi * np.round((near - forms) / (2.0 * np.pi))
-    return np.asarray(forms[np.argmin(np.abs(forms - near).sum(axis=1))])
+    forms += 2.0 * np.pi * np.round((reference - forms) / (2.0 * np.pi))
+    return np.asarray(forms[np.argmin(np.abs(forms - reference).sum(axis=1))])
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
@@ -284,11 +284,11 @@ def cross(a: Array, b: Array) -> Array:
         return np.asarray(first - second)
     ax, ay, az = np.moveaxis(a, -1, 0)
     bx, by, bz = np.moveaxis(b, -1, 0)
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0] = ay * bz - az * by
-    out[..., 1] = az * bx - ax * bz
-    out[..., 2] = ax * by - ay * bx
-    return out
+    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    product[..., 0] = ay * bz - az * by
+    product[..., 1] = az * bx - ax * bz
+    product[..., 2] = ax * by - ay * bx
+    return product
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -300,8 +300,8 @@ def dot(a: Array, b: Array) -> Array:
 
 def columns(a: Array, b: Array, c: Array) -> Array:
     """Matrices (..., 3, 3) with the given columns."""
-    out = np.empty((*a.shape, 3))
-    out[..., 0] = a
-    out[..., 1] = b
-    out[..., 2] = c
-    return out
+    matrices = np.empty((*a.shape, 3))
+    matrices[..., 0] = a
+    matrices[..., 1] = b
+    matrices[..., 2] = c
+    return matrices

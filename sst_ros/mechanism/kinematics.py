@@ -280,13 +280,13 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     roots of a configuration are isolated, (n,): where they are not, none is given.
     """
     r_1 = r[:, 0]
-    others = r[:, 1:]  # r_2 and r_3
+    directions = r[:, 1:]  # r_2 and r_3
     n = cross(r_1, np.eye(3)[np.argmin(np.abs(r_1), axis=1)])
     n /= np.linalg.norm(n, axis=1)[:, None]
     m = cross(r_1, n)
-    along_n = (others @ n[:, :, None])[..., 0]
-    along_m = (others @ m[:, :, None])[..., 0]
-    along_r = (others @ r_1[:, :, None])[..., 0]
+    along_n = (directions @ n[:, :, None])[..., 0]
+    along_m = (directions @ m[:, :, None])[..., 0]
+    along_r = (directions @ r_1[:, :, None])[..., 0]
     e_x, e_y = e[..., 1:, 0], e[..., 1:, 1]
     # Of legs 2 and 3: coefficients of (cos x, sin x) in a and c, shape (n, 2, 2), and
     # the number b, (n, 2).
@@ -508,5 +508,5 @@ def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
     first_entry = t_1[np.arange(len(t_1)), np.argmax(t_1 != 0.0, axis=1)]
     is_behind = (first_entry < 0.0)[:, None, None]
     leading = np.where(is_behind, partner, rotation)
-    both = np.stack([leading, leading * HALF_TURN], axis=1)
-    return np.repeat(owner, 2), both.reshape(-1, 3, 3)
+    pairs = np.stack([leading, leading * HALF_TURN], axis=1)
+    return np.repeat(owner, 2), pairs.reshape(-1, 3, 3)

@@ -161,8 +161,8 @@ def distance_to_singularity(
     geometry = where if isinstance(where, Geometry) else Geometry.of(scene_of(where))
     angles = read_numbers("distance_to_singularity", "gamma", gamma)
     fits = angles.shape == (3,) or (angles.ndim == 2 and angles.shape[1] == 3)
-    allowed = "must be three angles [rad], or rows of them"
-    refuse_unless("distance_to_singularity", ("gamma", gamma, fits, allowed))
+    requirement = "must be three angles [rad], or rows of them"
+    refuse_unless("distance_to_singularity", ("gamma", gamma, fits, requirement))
     if angles.ndim == 1:
         rotation = kinematics.admissible(geometry, angles).rotation
         return _find_nearest(geometry, rotation[None])[0]
@@ -258,7 +258,7 @@ def _det_along(e: Array, axes: Array, rays: Array) -> Array:
     constant = np.broadcast_to(w, (len(axes), len(rays), 3, 3))
     linear = -2.0 * cross(ray, w)
     quadratic = 2.0 * dot(ray, w)[..., None] * ray - w
-    rows = [_across(e, part) for part in (constant, linear, quadratic)]
+    rows = [_across(e, coefficient) for coefficient in (constant, linear, quadratic)]
     count = len(axes), len(rays)
     normals = np.zeros((5, *count, 3))  # of the second and third leg, by degree
     for i, second in enumerate(rows):
@@ -304,9 +304,9 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
         normals[:, k] = cross(rows[:, following], rows[:, last])
         for i, j in np.ndindex(3, 3):
             first, second = slopes[i][:, following], slopes[j][:, last]
-            both = dot(rows[:, k], cross(first, second))
-            hessian[:, i, j] += both
-            hessian[:, j, i] += both
+            mixed = dot(rows[:, k], cross(first, second))
+            hessian[:, i, j] += mixed
+            hessian[:, j, i] += mixed
     for i, slope in enumerate(slopes):
         gradient[:, i] = dot(slope, normals).sum(axis=1)
         for j in range(3):

@@ -103,8 +103,8 @@ def body_rates(
     a matrix that could be singular; the mean of the three is taken. Where the
     orientation is nan, it is.
     """
-    known = np.isfinite(quaternion).all(axis=-1, keepdims=True)
-    rotation = rotation_matrix(np.where(known, quaternion, (0.0, 0.0, 0.0, 1.0)))
+    is_finite = np.isfinite(quaternion).all(axis=-1, keepdims=True)
+    rotation = rotation_matrix(np.where(is_finite, quaternion, (0.0, 0.0, 0.0, 1.0)))
     t = geometry.e  # rows in {E}, as those of w and r
     w = geometry.w @ rotation
     r = np.cross(t, w)
@@ -113,7 +113,7 @@ def body_rates(
     of_mu = r * mu_dot[..., None]
     of_beta = t * beta_dot[..., None]
     of_legs = of_gamma - of_mu - of_beta
-    return np.asarray(np.where(known, of_legs.mean(axis=-2), np.nan))
+    return np.asarray(np.where(is_finite, of_legs.mean(axis=-2), np.nan))
 
 
 def _motion(

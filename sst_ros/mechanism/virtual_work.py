@@ -22,7 +22,7 @@ from sst_ros.mechanism.geometry import Array, Geometry, cross
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
-Three: TypeAlias = ArrayLike  # three numbers, one a leg or an axis
+VectorLike: TypeAlias = ArrayLike  # three numbers, one a leg or an axis
 # smallest abs(det J2) and abs(c_k) for which the velocity analysis is done
 SINGULAR_MATRIX = 1e-12
 
@@ -116,48 +116,49 @@ def posture(
     return Posture(angles, rotation, r, t, w, c, j2, j, a, b, u)
 
 
-def bias(at: Posture, gamma_dot: ArrayLike) -> Bias:
+def bias(posture: Posture, gamma_dot: ArrayLike) -> Bias:
     """Acceleration analysis at gamma_ddot = 0, Eqs. 24 to 49."""
     rate = np.asarray(gamma_dot, dtype=float)
-    omega = at.j @ rate
-    mu_dot = at.a @ rate
-    beta_dot = at.b @ rate
-    tw = np.sum(at.t * at.w, axis=1)
+    omega = posture.j @ rate
+    mu_dot = posture.a @ rate
+    beta_dot = posture.b @ rate
+    tw = np.sum(posture.t * posture.w, axis=1)
     m = mu_dot * tw  # Eq. 38
-    n = -beta_dot * (at.r @ omega)  # Eq. 39
-    solved = np.linalg.solve(at.j2, m * rate + n)
-    tr = cross(at.t, at.r)
-    f = -beta_dot * (tr @ omega) + at.r @ solved  # Eq. 45
-    wr = cross(at.w, at.r)
-    u = at.t @ solved - np.sum(at.t * wr, axis=1) * rate * mu_dot  # Eq. 49
+    n = -beta_dot * (posture.r @ omega)  # Eq. 39
+    solved = np.linalg.solve(posture.j2, m * rate + n)
+    tr = cross(posture.t, posture.r)
+    f = -beta_dot * (tr @ omega) + posture.r @ solved  # Eq. 45
+    wr = cross(posture.w, posture.r)
+    u = posture.t @ solved - np.sum(posture.t * wr, axis=1) * rate * mu_dot  # Eq. 49
     return Bias(omega, -solved, f, u)
 
 
-def link_frames(at: Posture) -> tuple[Array, Array]:
+def link_frames(posture: Posture) -> tuple[Array, Array]:
     """Rotations of {1k} and {2k} in {B}, Eqs. 50 to 52, each shape (3, 3, 3)."""
-    first = np.stack([at.r, cross(at.w, at.r), at.w], axis=2)
-    second = np.stack([at.r, cross(at.t, at.r), at.t], axis=2)
+    first = np.stack([posture.r, cross(posture.w, posture.r), posture.w], axis=2)
+    second = np.stack([posture.r, cross(posture.t, posture.r), posture.t], axis=2)
     return first, second
 
 
-def link_jacobians(at: Posture) -> tuple[Array, Array]:
+def link_jacobians(posture: Posture) -> tuple[Array, Array]:
     """Direct link Jacobians J_a in {1k} and J_ipl in {2k}, Eqs. 57 and 61.
 
     Shape (3, 3, 3) each, legs first.
     """
-    first, second = link_frames(at)
+    first, second = link_frames(posture)
     d = np.eye(3)
-    ja, jipl = np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    ja = np.empty((3, 3, 3))
+    jipl = np.empty((3, 3, 3))
     for k in range(3):
-        of_gamma = np.outer(at.w[k], d[k])
-        of_mu = np.outer(at.r[k], at.a[k])
+        of_gamma = np.outer(posture.w[k], d[k])
+        of_mu = np.outer(posture.r[k], posture.a[k])
         ja[k] = first[k].T @ of_gamma
         jipl[k] = second[k].T @ (of_gamma - of_mu)
     return ja, jipl
 
 
 def equation_of_motion(
-    mechanism: Mechanism, at: Posture, gamma_dot: Three, moment: Three = ZERO
+    mechanism: Mechanism, at: Posture, gamma_dot: VectorLike, moment: VectorLike = ZERO
 ) -> tuple[Array, Array]:
     """T1 and T2 of the equation of motion T1 gamma_ddot + T2 + tau = 0, Eqs. 63 to 92.
 
@@ -196,9 +197,9 @@ def equation_of_motion(
 def direct_dynamics(
     mechanism: Mechanism,
     at: Posture,
-    gamma_dot: Three,
-    torque: Three,
-    moment: Three = ZERO,
+    gamma_dot: VectorLike,
+    torque: VectorLike,
+    moment: VectorLike = ZERO,
 ) -> Array:
     """gamma_ddot [rad/s^2], shape (3,), of actuator torques [N m], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)
@@ -208,9 +209,9 @@ def direct_dynamics(
 def inverse_dynamics(
     mechanism: Mechanism,
     at: Posture,
-    gamma_dot: Three,
-    gamma_ddot: Three,
-    moment: Three = ZERO,
+    gamma_dot: VectorLike,
+    gamma_ddot: VectorLike,
+    moment: VectorLike = ZERO,
 ) -> Array:
     """Actuator torques [N m], shape (3,), that give gamma_ddot [rad/s^2], Eq. 90."""
     t1, t2 = equation_of_motion(mechanism, at, gamma_dot, moment)

@@ -170,11 +170,11 @@ def workspace(
     on a terminal.
     """
     is_small = int(divisions) ** 2 * int(turns) // 2 <= MOST_POSES
-    allowed = f"must be at least 1, and make no more than {MOST_POSES:g} poses"
+    requirement = f"must be at least 1, and make no more than {MOST_POSES:g} poses"
     refuse_unless(
         "workspace",
-        ("divisions", divisions, divisions >= 1 and is_small, allowed),
-        ("turns", turns, turns >= 1 and is_small, allowed),
+        ("divisions", divisions, divisions >= 1 and is_small, requirement),
+        ("turns", turns, turns >= 1 and is_small, requirement),
     )
     s, _ = triangle_directions(geometry, divisions)
     return over_orientations(geometry, s, turns, progress)
