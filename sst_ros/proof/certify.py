@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import math
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -42,7 +42,13 @@ from sst_ros.errors import (
     require,
 )
 from sst_ros.mechanism import generic_math as gm
-from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
+from sst_ros.mechanism.generic_math import (
+    Quadruple,
+    cross3,
+    dot3,
+    quaternion_product,
+    triple,
+)
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import Bar
 from sst_ros.proof import enclosure
@@ -50,6 +56,7 @@ from sst_ros.proof.balls import (
     arb,
     arb_mat,
     arb_poly,
+    arb_series,
     between,
     norm,
     precision,
@@ -59,7 +66,7 @@ from sst_ros.proof.balls import (
 )
 from sst_ros.proof.closed_loop import CertifiedControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
-from sst_ros.proof.root import krawczyk
+from sst_ros.proof.root import Root, krawczyk
 from sst_ros.proof.scene_balls import (
     NumberReading,
     Parts,
@@ -137,24 +144,10 @@ class BallEquations:
         that are ranges.
         """
         x, y, z, w, *rate = start_of(self.scene)[:7]
-
-        def equations(traced_scene: Parts, *inputs: Any) -> list[Any]:
-            turn, body_rate, angles, rates = (
-                inputs[k : k + 3] for k in range(0, 12, 3)
-            )
-            q = quaternion_product((x, y, z, w), (turn[0], turn[1], turn[2], 1.0))
-            legs = list(kernel.leg_motions(traced_scene.model, (*q, *body_rate)))
-            gaps = []
-            for leg, angle in zip(legs, angles, strict=True):
-                sine, cosine = kernel.direction_of(leg, 0)
-                gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
-            return gaps + [
-                leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)
-            ]
-
         unknown = (*TURN_SYMBOLS, *RATE_SYMBOLS)
         initial = (*GAMMA_SYMBOLS, *ANGLE_RATES)
         by = (*unknown, *initial, *self.balls.inputs)
+        equations = _start_equations((x, y, z, w))
         run = self.balls.compile(equations, (*unknown, *initial), by)
         initial_numbers = [
             *self.balls.initial("gamma"),
@@ -167,31 +160,12 @@ class BallEquations:
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], parameters, AT_START)
         size = len(self.state)
         n = size + len(self.balls.inputs)
-        # Columns of the set: a range of an initial number has one, in place of a number
-        # of the state; how numbers are read, and all other ranges, have that of their
-        # own input.
-        by_column = [[arb(0)] * n for _ in unknown]
-        off = [arb(0)] * len(unknown)
-        radii = [arb(0)] * n
-        for j, ball in enumerate(parameters):
-            place = j if j < len(initial) else size + j - len(initial)
-            factor = arb(1)
-            radius = ball.rad()
-            if j < len(initial) and isinstance(
-                reading := initial_numbers[j], NumberReading
-            ):
-                place = n - 1
-                factor = reading.half
-                radius = arb(0)
-                missing = abs(reading.middle - ball.mid())
-                for i in range(len(unknown)):
-                    off[i] += abs(root.slopes[i, j]) * missing
-            for i in range(len(unknown)):
-                by_column[i][place] += root.slopes[i, j] * factor
-            radii[place] = arb.max(radii[place], radius)
+        by_column, radii, reading_errors = self._columns_of_start(
+            root, initial_numbers, parameters
+        )
         remainder = [
             x + reading_error
-            for x, reading_error in zip(root.remainder, off, strict=True)
+            for x, reading_error in zip(root.remainder, reading_errors, strict=True)
         ]
         # q is linear in the turn.
         units = [quaternion_product((x, y, z, w), unit) for unit in _UNIT_QUATERNIONS]
@@ -222,6 +196,39 @@ class BallEquations:
         centre = [*turned, *root.middle[3:], *lagged, *varied]
         region = Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
         return region if self.loop is None else self.loop.begin(region)
+
+    def _columns_of_start(
+        self, root: Root, initial_numbers: Sequence[Any], parameters: Sequence[Any]
+    ) -> tuple[list[list[Any]], list[Any], list[Any]]:
+        """Return how the root depends on the numbers of the set, column by column.
+
+        The radii of the columns follow, then bounds of what the readings leave out.
+        """
+        size = len(self.state)
+        n = size + len(self.balls.inputs)
+        # Columns of the set: a range of an initial number has one, in place of a number
+        # of the state; how numbers are read, and all other ranges, have that of their
+        # own input.
+        by_column = [[arb(0)] * n for _ in root.middle]
+        reading_errors = [arb(0)] * len(root.middle)
+        radii = [arb(0)] * n
+        for j, ball in enumerate(parameters):
+            place = j if j < len(initial_numbers) else size + j - len(initial_numbers)
+            factor = arb(1)
+            radius = ball.rad()
+            if j < len(initial_numbers) and isinstance(
+                reading := initial_numbers[j], NumberReading
+            ):
+                place = n - 1
+                factor = reading.half
+                radius = arb(0)
+                missing = abs(reading.middle - ball.mid())
+                for i in range(len(root.middle)):
+                    reading_errors[i] += abs(root.slopes[i, j]) * missing
+            for i in range(len(root.middle)):
+                by_column[i][place] += root.slopes[i, j] * factor
+            radii[place] = arb.max(radii[place], radius)
+        return by_column, radii, reading_errors
 
     def _unlimited(
         self, traced_scene: Parts, time: Any, command: Sequence[Any]
@@ -294,7 +301,7 @@ class BallEquations:
             torque_piece = self._profile.piece(begin, end)
 
         def commanded(time: Any, *y: Any) -> Sequence[Any]:
-            command = map(arb, torque_piece.at(time))
+            command = [_ball_or_series(x) for x in torque_piece.at(time)]
             return function(time, *y[:size], *command, *y[size:])
 
         return commanded
@@ -429,6 +436,31 @@ class BallEquations:
 
         inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
         return self.balls.compile(distances, inputs)
+
+
+def _ball_or_series(torque: Any) -> Any:
+    """Return the ball of a number; a series of the time stays one."""
+    return torque if isinstance(torque, arb_series) else arb(torque)
+
+
+def _start_equations(orientation: Quadruple) -> Callable[..., list[Any]]:
+    """Return the equations of the start, whose unknowns are a turn and the body rate.
+
+    The first three are zero where the turn from the orientation puts the legs at the
+    angles of the actuators, the others where their rates agree.
+    """
+
+    def equations(traced_scene: Parts, *inputs: Any) -> list[Any]:
+        turn, body_rate, angles, rates = (inputs[k : k + 3] for k in range(0, 12, 3))
+        q = quaternion_product(orientation, (turn[0], turn[1], turn[2], 1.0))
+        legs = list(kernel.leg_motions(traced_scene.model, (*q, *body_rate)))
+        gaps = []
+        for leg, angle in zip(legs, angles, strict=True):
+            sine, cosine = kernel.direction_of(leg, 0)
+            gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
+        return gaps + [leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)]
+
+    return equations
 
 
 class Row(NamedTuple):
@@ -874,6 +906,12 @@ class ProofTask(NamedTuple):
             tolerance *= 0.1 * self.bound / follower.largest
         return follower
 
+    def prove_boxes(self, ranges: Mapping[Place, Any]) -> list[Follower]:
+        """Prove the motion for each part of the box of ranges."""
+        wide = {place: x for place, x in ranges.items() if x.rad() > 0}
+        boxes = split_ranges(wide, self.split) if wide else [{}]
+        return [self.prove_part({**ranges, **box}) for box in boxes]
+
     def prove_part(self, ranges: Mapping[Place, Any]) -> Follower:
         """Prove the motion for all numbers of ranges.
 
@@ -1068,10 +1106,7 @@ def certify(
         task = ProofTask(
             trajectory, profile, breaks, bound, max_steps, progress, control, split
         )
-        wide = {place: x for place, x in balls.items() if x.rad() > 0}
-        boxes = split_ranges(wide, split) if wide else [{}]
-        proofs = [task.prove_part({**balls, **box}) for box in boxes]
-        return ProvenMotion(proofs, bound, trajectory)
+        return ProvenMotion(task.prove_boxes(balls), bound, trajectory)
 
 
 def _read_control(

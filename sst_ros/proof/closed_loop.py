@@ -278,6 +278,26 @@ class SampledLoop:
         with record.within(replay=True):
             values = run(region.centre, [arb(0)] * 6, turn)[:count]
         blocks = [flat[k : k + count] for k in range(count, len(flat), count)]
+        return self._chain_slopes(values, blocks, by_gamma, turn_rest, gamma_slopes)
+
+    def _chain_slopes(
+        self,
+        values: list[Any],
+        blocks: Sequence[Sequence[Any]],
+        by_gamma: Any,
+        turn_rest: Sequence[Any],
+        gamma_slopes: Sequence[dict[int, Any]],
+    ) -> _Response:
+        """Return the slopes of the law by the region and by the noise.
+
+        The blocks have its derivatives by each input. Those by the turn are chained
+        with the slopes of the turn by the measured angles, and these with the slopes
+        of the angles by the region.
+        """
+        size, varied = self._size, self._varied
+        memory = len(self.memory)
+        width = size + 3 + memory + varied
+        count = len(values)
         by_state, by_memory = blocks[:size], blocks[size : size + memory]
         by_noise = blocks[size + memory : size + memory + 6]
         by_turn = blocks[size + memory + 6 : size + memory + 9]
@@ -291,13 +311,13 @@ class SampledLoop:
         ]
         rows, noise_rows, observer_bounds = [], [], []
         for i in range(count):
-            row = [arb(0)] * len(box)
+            row = [arb(0)] * width
             for j, block in enumerate(by_state):
                 row[j] = block[i]
             for j, block in enumerate(by_memory):
                 row[size + 3 + j] = block[i]
             for j, block in enumerate(by_varied):
-                row[len(box) - varied + j] = block[i]
+                row[width - varied + j] = block[i]
             for k in range(3):
                 for j, slope in gamma_slopes[k].items():
                     row[j] = row[j] + by_measured[i][k] * slope
