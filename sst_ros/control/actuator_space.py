@@ -65,7 +65,8 @@ class Reference:
 
 
 REFERENCE_SIZES = {
-    part.name: 4 if part.name == "quaternion" else 3 for part in fields(Reference)
+    quantity.name: 4 if quantity.name == "quaternion" else 3
+    for quantity in fields(Reference)
 }
 """Numbers of each part of a `Reference`, as inputs of a traced control law."""
 
@@ -105,13 +106,13 @@ class ReferenceMotion(Explained):
             refuse_unless("motion", ("time", time, False, "must be a number [s]"))
         inside = min(max(time, 0.0), self.duration)
         try:
-            found = self._inside(inside)
+            reference = self._inside(inside)
         except ArithmeticError:
-            said = f"serial singularity at t = {inside:.9g} s, sin(mu)"
-            raise SingularConfiguration(said, 0.0) from None
+            cause = f"serial singularity at t = {inside:.9g} s, sin(mu)"
+            raise SingularConfiguration(cause, 0.0) from None
         if time == inside:
-            return found
-        return Reference(found.quaternion, ZERO, ZERO, found.gamma, ZERO, ZERO)
+            return reference
+        return Reference(reference.quaternion, ZERO, ZERO, reference.gamma, ZERO, ZERO)
 
     def effort_at(self, time: float) -> Vector3 | None:
         """Return the torques [N m] to add at a time [s].
@@ -123,10 +124,10 @@ class ReferenceMotion(Explained):
         return self.effort(min(max(time, 0.0), self.duration))
 
     def _facts(self) -> dict[str, object]:
-        pieces = len(self.pieces) - 1
+        piece_count = len(self.pieces) - 1
         facts: dict[str, object] = {
             "duration [s]": self.duration,
-            "smooth pieces": pieces,
+            "smooth pieces": piece_count,
         }
         with contextlib.suppress(Exception):  # a representation raises nothing
             facts["begins at gamma [rad]"] = self.at(0.0).gamma
@@ -178,16 +179,19 @@ def _slowed_down(
     A function that pickle takes.
     """
     u = time / duration
-    at = motion.at(_slowed_time(begin, duration, time))
-    speed, change = 1.0 - u * u * (3.0 - 2.0 * u), -6.0 * u * (1.0 - u) / duration
+    reference = motion.at(_slowed_time(begin, duration, time))
+    speed = 1.0 - u * u * (3.0 - 2.0 * u)
+    change = -6.0 * u * (1.0 - u) / duration
     return replace(
-        at,
-        body_rate=multiply(speed, at.body_rate),
+        reference,
+        body_rate=multiply(speed, reference.body_rate),
         body_acceleration=axpy(
-            speed * speed, at.body_acceleration, change, at.body_rate
+            speed * speed, reference.body_acceleration, change, reference.body_rate
         ),
-        gamma_dot=multiply(speed, at.gamma_dot),
-        gamma_ddot=axpy(speed * speed, at.gamma_ddot, change, at.gamma_dot),
+        gamma_dot=multiply(speed, reference.gamma_dot),
+        gamma_ddot=axpy(
+            speed * speed, reference.gamma_ddot, change, reference.gamma_dot
+        ),
     )
 
 
@@ -237,8 +241,8 @@ class ActuatorSpaceMap:
 
     def follow(
         self,
-        known: Quaternion,
-        here: Vector3,
+        start_quaternion: Quaternion,
+        start_gamma: Vector3,
         gamma: Vector3,
         sigma: float | None = None,
     ) -> Quaternion:
@@ -251,30 +255,37 @@ class ActuatorSpaceMap:
         abs(det J2): enough for most steps, and cheap. Raises BranchEnds where a
         parallel singularity lies between, or no assembly has these angles.
         """
-        step = math.dist(gamma, here)
+        step = math.dist(gamma, start_gamma)
         with contextlib.suppress(ArithmeticError):
             if sigma is None:
-                sigma = 2.0 / 3.0 * abs(self.posture(*known)[-1])
+                sigma = 2.0 / 3.0 * abs(self.posture(*start_quaternion)[-1])
             if step <= continuation.SAFE_STEP * sigma * sigma:
-                found = self._find_orientation(known, gamma)
+                quaternion = self._find_orientation(start_quaternion, gamma)
                 # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle /
                 # 2).
                 half = math.sqrt(
-                    max(0.0, 1.0 - sum(map(float.__mul__, found, known)) ** 2)
+                    max(
+                        0.0,
+                        1.0
+                        - sum(map(float.__mul__, quaternion, start_quaternion)) ** 2,
+                    )
                 )
                 if half <= 0.25 * (sigma - step):
-                    return found
-        return follow_assembly(self.geometry, known, here, gamma)
+                    return quaternion
+        return follow_assembly(self.geometry, start_quaternion, start_gamma, gamma)
 
-    def _find_orientation(self, near: Quaternion, gamma: Vector3) -> Quaternion:
-        """Return the unit quaternion of the assembly at gamma closest to `near`."""
+    def _find_orientation(self, guess: Quaternion, gamma: Vector3) -> Quaternion:
+        """Return the unit quaternion of the assembly at gamma closest to `guess`."""
         carriages = self.carriages(gamma)
-        best, least, q = near, math.inf, near
+        best = guess
+        q = guess
+        least = math.inf
         for _ in range(_INVERSION_STEPS):
             x, y, z, w, *residuals = self._newton(*q, *carriages)
             largest = max(map(abs, residuals))
             if largest < least:
-                best, least = q, largest
+                best = q
+                least = largest
             if not largest > ANGLE_ROUNDING:
                 break
             q = (x, y, z, w)
@@ -287,20 +298,23 @@ class ActuatorSpaceMap:
 
         The angles may be numbers of any kind.
         """
-        found: list[Any] = []
+        components: list[Any] = []
         for angle, leg in zip(gamma, self._legs, strict=True):
             c, s = gm.cos(angle), gm.sin(angle)
-            found += [c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)]
-        return found
+            components += [
+                c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)
+            ]
+        return components
 
     def orientations(
-        self, near: Array, gamma: Array, steps: int = _INVERSION_STEPS
+        self, guesses: Array, gamma: Array, steps: int = _INVERSION_STEPS
     ) -> Array:
         """Find quaternions (n, 4) at gamma (n, 3) by steps of Newton's method.
 
-        The steps begin at `near`, shape (n, 4).
+        The steps begin at `guesses`, shape (n, 4).
         """
-        carriages, q = self.carriages(gamma.T), list(near.T)
+        carriages = self.carriages(gamma.T)
+        q = list(guesses.T)
         for _ in range(steps):
             *q, first, second, third = self.newton_step(*q, *carriages)
             if np.abs((first, second, third)).max(initial=0.0) < 1e-9:
@@ -308,18 +322,17 @@ class ActuatorSpaceMap:
         return np.stack(q, axis=1)
 
     def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
-        rows, rate, acceleration = (
-            gm.rotation_rows(inputs[:4]),
-            inputs[4:7],
-            inputs[7:10],
-        )
+        rows = gm.rotation_rows(inputs[:4])
+        rate = inputs[4:7]
+        acceleration = inputs[7:10]
         legs = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
         return (
-            *(kernel.joint_angle(at, 0) for at in legs),
-            *(at.gamma_dot for at in legs),
+            *(kernel.joint_angle(moving_leg, 0) for moving_leg in legs),
+            *(moving_leg.gamma_dot for moving_leg in legs),
             *(
-                dot3(at.g, acceleration) + kernel.rest_accelerations(at, rate)[1]
-                for at in legs
+                dot3(moving_leg.g, acceleration)
+                + kernel.rest_accelerations(moving_leg, rate)[1]
+                for moving_leg in legs
             ),
         )
 
@@ -327,13 +340,13 @@ class ActuatorSpaceMap:
         """See `posture`; of a quaternion of numbers of any kind."""
         rows = gm.rotation_rows((q[0], q[1], q[2], q[3]))
         legs = [kernel.leg_motion(leg, rows, ZERO) for leg in self._legs]
-        sines = [gm.sqrt(at.u) for at in legs]
+        sines = [gm.sqrt(posed_leg.u) for posed_leg in legs]
         # Rows t_k x r_k of J2; p = r sin(mu).
         j2 = [
-            multiply(1.0 / s, cross3(at.along, at.p))
-            for s, at in zip(sines, legs, strict=True)
+            multiply(1.0 / s, cross3(posed_leg.along, posed_leg.p))
+            for s, posed_leg in zip(sines, legs, strict=True)
         ]
-        beta = (kernel.joint_angle(at, 2) for at in legs)
+        beta = (kernel.joint_angle(posed_leg, 2) for posed_leg in legs)
         return (*sines, *beta, dot3(j2[0], cross3(j2[1], j2[2])))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
@@ -341,22 +354,27 @@ class ActuatorSpaceMap:
 
         Numbers of any kind.
         """
-        rows, gamma_dot, gamma_ddot = (
-            gm.rotation_rows(inputs[:4]),
-            inputs[4:7],
-            inputs[7:10],
-        )
+        rows = gm.rotation_rows(inputs[:4])
+        gamma_dot = inputs[4:7]
+        gamma_ddot = inputs[7:10]
         reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
         rate = _solve(reach, gamma_dot)
         moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
-        rest = [kernel.rest_accelerations(at, rate)[1] for at in moving]
-        missing = [total - part for total, part in zip(gamma_ddot, rest, strict=True)]
+        rest_accelerations = [
+            kernel.rest_accelerations(moving_leg, rate)[1] for moving_leg in moving
+        ]
+        missing = [
+            total - rest_acceleration
+            for total, rest_acceleration in zip(
+                gamma_ddot, rest_accelerations, strict=True
+            )
+        ]
         return (*rate, *_solve(reach, missing))
 
     def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
-        """One step of Newton's method on r_k .
+        """Take a step of Newton's method for r_k . R e_k = 0.
 
-        R e_k = 0, and the residuals before it.
+        Return the quaternion after it, and the three residuals before it.
         """
         rows = gm.rotation_rows(inputs[:4])
         arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
@@ -366,8 +384,8 @@ class ActuatorSpaceMap:
         slope = [cross3(e, r) for r, e in zip(local, arcs, strict=True)]
         turn = multiply(-0.5, _solve(slope, residual))
         moved = gm.quaternion_product(inputs[:4], (*turn, 1.0))
-        length = gm.sqrt(sum(part * part for part in moved))
-        return (*(part / length for part in moved), *residual)
+        length = gm.sqrt(sum(component * component for component in moved))
+        return (*(component / length for component in moved), *residual)
 
 
 @lru_cache(maxsize=16)
@@ -383,27 +401,30 @@ def _compile(space: ActuatorSpaceMap) -> tuple[Callable[..., Any], ...]:
 
 def _solve(rows: list[Any], right: Any) -> Any:
     """Solve rows . x = right by Cramer's rule."""
-    others = (
+    normals = (
         cross3(rows[1], rows[2]),
         cross3(rows[2], rows[0]),
         cross3(rows[0], rows[1]),
     )
-    determinant = dot3(rows[0], others[0])
-    total = [
-        sum(map(operator.mul, right, parts)) for parts in zip(*others, strict=True)
+    determinant = dot3(rows[0], normals[0])
+    numerators = [
+        sum(map(operator.mul, right, components))
+        for components in zip(*normals, strict=True)
     ]
-    return tuple(part / determinant for part in total)
+    return tuple(numerator / determinant for numerator in numerators)
 
 
 def follow_assembly(
-    geometry: Geometry, start: Quaternion, here: ArrayLike, there: ArrayLike
+    geometry: Geometry, start: Quaternion, start_gamma: ArrayLike, end_gamma: ArrayLike
 ) -> Quaternion:
     """Follow the assembly from one gamma straight to another.
 
     Raises as `continuation.advance`.
     """
-    rotation = continuation.advance(geometry, rotation_matrix(start), here, there)
-    found = quaternion_of(rotation)
+    rotation = continuation.advance(
+        geometry, rotation_matrix(start), start_gamma, end_gamma
+    )
+    quaternion = quaternion_of(rotation)
     # the sign of the start
-    x, y, z, w = (found if found @ start >= 0.0 else -found).tolist()
+    x, y, z, w = (quaternion if quaternion @ start >= 0.0 else -quaternion).tolist()
     return (x, y, z, w)

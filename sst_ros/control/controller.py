@@ -87,16 +87,16 @@ class InverseDynamics(Explained):
         it. Raises SingularConfiguration, serial (sin(mu_k) = 0) or parallel (det J2 =
         0), where no torques control the star; InputError for numbers that are no state.
         """
-        parts = (
+        arguments = (
             quaternion,
             body_rate,
             body_acceleration,
             moment if self._has_moment_topic else (),
         )
-        given: Any = parts
+        numbers: Any = arguments
         with contextlib.suppress(ArithmeticError, TypeError, ValueError, MemoryError):
-            given = *parts[0], *parts[1], *parts[2], *parts[3]
-            first, second, third, determinant, *squares = self._program(*given)
+            numbers = *arguments[0], *arguments[1], *arguments[2], *arguments[3]
+            first, second, third, determinant, *squares = self._program(*numbers)
             total = first + second + third + determinant
             if isinstance(total, float):  # it is none of masked or complex numbers
                 det_j2 = abs(determinant) * math.sqrt(
@@ -106,7 +106,7 @@ class InverseDynamics(Explained):
                 sound = math.isfinite(first + second + third) and det_j2 > SINGULAR_MASS
                 if sound and min(squares) > SINGULAR_MASS * SINGULAR_MASS:
                     return first, second, third
-        raise self._refusal(quaternion, given)
+        raise self._refusal(quaternion, numbers)
 
     @check_kinds_late
     def reference_torque(self, reference: Reference) -> Vector3:
@@ -177,8 +177,12 @@ class InverseDynamics(Explained):
             "inverse dynamics", ("moment", moment, three, "must be three numbers [N m]")
         )
         q, rate = state.quaternion, state.body_rate
-        rest = kernel.actuator_acceleration(self._dynamics.model, (*q, *rate), ZERO)
-        acceleration = np.linalg.solve(self._reduce(q)[1], np.negative(rest))
+        rest_acceleration = kernel.actuator_acceleration(
+            self._dynamics.model, (*q, *rate), ZERO
+        )
+        acceleration = np.linalg.solve(
+            self._reduce(q)[1], np.negative(rest_acceleration)
+        )
         return self.torque(q, rate, triple(acceleration.tolist()), moment)
 
     @check_kinds
@@ -200,31 +204,31 @@ class InverseDynamics(Explained):
         acting = rotation_matrix(q).T @ np.asarray(moment, dtype=float)
         return triple(np.linalg.solve(reach.T, acting).tolist())
 
-    def _orientation(self, at: Pose | Poses) -> Quaternion:
+    def _orientation(self, pose: Pose | Poses) -> Quaternion:
         """Quaternion of {E} in {B} of a state, of angles gamma or of itself."""
-        pose: Any = at.quaternion if isinstance(at, State) else at
-        allowed = (
+        numbers: Any = pose.quaternion if isinstance(pose, State) else pose
+        requirement = (
             "must be a State, three angles gamma or a quaternion, or rows of either"
         )
-        pose = read_numbers("inverse dynamics", "at", pose)
-        fits = pose.shape in ((3,), (4,))
-        refuse_unless("inverse dynamics", ("at", at, fits, allowed))
-        if len(pose) == 3:
-            rotation = kinematics.admissible(Geometry.of(self.scene), pose).rotation
-            pose = quaternion_of(rotation)
-        x, y, z, w = pose.tolist()
+        numbers = read_numbers("inverse dynamics", "at", numbers)
+        fits = numbers.shape in ((3,), (4,))
+        refuse_unless("inverse dynamics", ("at", pose, fits, requirement))
+        if len(numbers) == 3:
+            rotation = kinematics.admissible(Geometry.of(self.scene), numbers).rotation
+            numbers = quaternion_of(rotation)
+        x, y, z, w = numbers.tolist()
         return x, y, z, w
 
-    def _orientations(self, at: Pose | Poses) -> Array | None:
-        """Quaternions of many poses, shape (n, 4); None where `at` is not rows."""
-        if isinstance(at, State):
+    def _orientations(self, pose: Pose | Poses) -> Array | None:
+        """Quaternions of many poses, shape (n, 4); None where `pose` is not rows."""
+        if isinstance(pose, State):
             return None
-        poses = read_numbers("inverse dynamics", "at", at)
+        poses = read_numbers("inverse dynamics", "at", pose)
         if poses.ndim != 2:
             return None
         fits = poses.shape[1] in (3, 4)
-        allowed = "must be rows of three angles gamma or of quaternions"
-        refuse_unless("inverse dynamics", ("at", at, fits, allowed))
+        requirement = "must be rows of three angles gamma or of quaternions"
+        refuse_unless("inverse dynamics", ("at", pose, fits, requirement))
         if poses.shape[1] == 4:
             return poses
         geometry = Geometry.of(self.scene)
@@ -271,18 +275,19 @@ class InverseDynamics(Explained):
         }
 
     def _refusal(
-        self, quaternion: Quaternion, given: Sequence[float]
+        self, quaternion: Quaternion, numbers: Sequence[float]
     ) -> SingularConfiguration:
         """Return why there is no torque; raises InputError where numbers are wrong."""
-        lost, finite = find_lost_meaning([*given, quaternion]), False
-        refuse_unless("inverse dynamics", ("state", tuple(given), not lost, lost))
+        lost = find_lost_meaning([*numbers, quaternion])
+        finite = False
+        refuse_unless("inverse dynamics", ("state", tuple(numbers), not lost, lost))
         with contextlib.suppress(TypeError, ValueError, OverflowError):
-            sizes = len(given), len(quaternion)
-            finite = sizes in ((10, 4), (13, 4)) and all(map(math.isfinite, given))
+            sizes = len(numbers), len(quaternion)
+            finite = sizes in ((10, 4), (13, 4)) and all(map(math.isfinite, numbers))
         short = finite and math.hypot(*quaternion) < 1e-100
         refuse_unless(
             "inverse dynamics",
-            ("state", tuple(given), finite, "must be finite numbers"),
+            ("state", tuple(numbers), finite, "must be finite numbers"),
             ("quaternion", quaternion, not short, "must have a length > 0"),
         )
         geometry = Geometry.of(self.scene)
@@ -294,12 +299,12 @@ class InverseDynamics(Explained):
             return SingularConfiguration("serial singularity, sin(mu)", least)
         determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
         parallel = abs(determinant) <= 2.0 * SINGULAR_MASS
-        said = (
+        cause = (
             "parallel singularity,"
             if parallel
             else "no finite torque gives this acceleration:"
         )
-        return SingularConfiguration(f"{said} det J2", determinant)
+        return SingularConfiguration(f"{cause} det J2", determinant)
 
 
 class ControlStopped(SstError):
@@ -335,7 +340,8 @@ class ChannelState:
 
         It receives gamma [rad] and gamma_dot [rad/s], as they are measured.
         """
-        channel, noise = self._channel, []
+        channel = self._channel
+        noise: list[float] = []
         if channel.counts and self._before is None:
             earlier = axpy(1.0, gamma, -channel.period, gamma_dot)
             self._before = tuple(map(channel.count, earlier))
@@ -374,7 +380,8 @@ class Controller:
     ) -> None:
         model = scene_of(model)
         self._motion, self._settings, self._period_s = motion, settings, period_s
-        geometry, start = Geometry.of(model), motion.at(0.0)
+        geometry = Geometry.of(model)
+        start = motion.at(0.0)
         self._inverse, self._space = InverseDynamics(model), ActuatorSpaceMap(geometry)
         self._begin = start.quaternion, start.gamma
         rotation = rotation_matrix(start.quaternion)
@@ -420,18 +427,19 @@ class Controller:
         Raises InputError where the integral action would be unstable.
         """
         settings = settings or self._settings
-        column, rate = np.array(self.inertia)[:, None], settings.integral_rate
+        column = np.array(self.inertia)[:, None]
+        rate = settings.integral_rate
         gains = law.feedback_gains(
             column, lambda name: getattr(settings, name), settings.direct
         )
         kp, kd = (triple(gain[:, 0].tolist()) for gain in gains)
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
-        allowed = (
+        requirement = (
             f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is"
             " unstable"
         )
         refuse_unless(
-            "control", ("integral_rate", rate, not rate or rate < min(kd), allowed)
+            "control", ("integral_rate", rate, not rate or rate < min(kd), requirement)
         )
         return law.ControlLaw(
             settings,
@@ -470,7 +478,9 @@ class Controller:
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""
-        self._known, self._integral = self._begin, ZERO
+        # orientation and gamma from which the next orientation is found
+        self._last_observed = self._begin
+        self._integral = ZERO
         self._failure: ControlStopped | None = None
 
     @check_kinds
@@ -490,12 +500,13 @@ class Controller:
         desired = self._motion.at(time)
         if not self._settings.feeds:
             return desired, ZERO, ZERO
-        now = held = self._inverse.reference_torque(desired)
+        present_torque = self._inverse.reference_torque(desired)
+        held_torque = present_torque
         if self._settings.feedforward_at == "middle":
-            held = self._inverse.reference_torque(
+            held_torque = self._inverse.reference_torque(
                 self._motion.at(self._hold_time(time))
             )
-        return desired, now, held
+        return desired, present_torque, held_torque
 
     def _hold_time(self, time: float) -> float:
         """Return the time of the feedforward held over a period.
@@ -516,15 +527,19 @@ class Controller:
             raise self._failure
         if lost := "" if type(time) is float else find_lost_meaning(time):
             refuse_unless("control", ("time", time, False, lost))
-        allowed, observes = "must be finite numbers", self._settings.observes
+        requirement = "must be finite numbers"
+        observes = self._settings.observes
         try:
-            given = (*measured.gamma, *measured.gamma_dot)
+            numbers = (*measured.gamma, *measured.gamma_dot)
             refuse_unless(
-                "control", ("measured", given, all(map(math.isfinite, given)), allowed)
+                "control",
+                ("measured", numbers, all(map(math.isfinite, numbers)), requirement),
             )
             desired, *torques = self.desire(time)
             observed: Any = (
-                self._space.follow(*self._known, measured.gamma) if observes else ()
+                self._space.follow(*self._last_observed, measured.gamma)
+                if observes
+                else ()
             )
             command = self._law.answer(
                 desired,
@@ -536,14 +551,15 @@ class Controller:
             )
             total = command.total
             refuse_unless(
-                "control", ("torque", total, all(map(math.isfinite, total)), allowed)
+                "control",
+                ("torque", total, all(map(math.isfinite, total)), requirement),
             )
         except (SstError, ArithmeticError, ValueError) as error:
             self._failure = ControlStopped(str(error), time)
             raise self._failure from error
         self._integral = command.integral
         if observes:
-            self._known = observed, measured.gamma
+            self._last_observed = observed, measured.gamma
         return command
 
     def __call__(self, time: float, state: State) -> Vector3:
@@ -600,9 +616,15 @@ class TrackingMetrics:
 
     def add(self, track: Track) -> None:
         """Add the next part of the record, of one sample or more."""
-        error, torque = np.abs(track.error), track.torque
-        parts = error**2, torque**2, track.feedforward * torque, track.feedback * torque
-        self._sums += [np.sum(part, axis=0) for part in parts]
+        error = np.abs(track.error)
+        torque = track.torque
+        products = (
+            error**2,
+            torque**2,
+            track.feedforward * torque,
+            track.feedback * torque,
+        )
+        self._sums += [np.sum(product, axis=0) for product in products]
         self.largest = np.maximum(self.largest, error.max(axis=0))
         self.torque_largest = np.maximum(
             self.torque_largest, np.abs(torque).max(axis=0)
@@ -653,12 +675,12 @@ class TrackingMetrics:
         return self._settled - self._rested
 
 
-def _since(known: float | None, wrong: NDArray[np.bool_], time: Array) -> float | None:
-    """Return since when nothing has been wrong, behind the next part.
+def _since(since: float | None, wrong: NDArray[np.bool_], time: Array) -> float | None:
+    """Return the time since when no sample has been wrong [s].
 
-    None where its end is.
+    It was `since` before these samples. None where the last one is wrong.
     """
-    if known is not None and not wrong.any():
-        return known
-    rest = int(np.max(np.flatnonzero(wrong), initial=-1)) + 1
-    return float(time[rest]) if rest < len(time) else None
+    if since is not None and not wrong.any():
+        return since
+    first_right = int(np.max(np.flatnonzero(wrong), initial=-1)) + 1
+    return float(time[first_right]) if first_right < len(time) else None

@@ -100,8 +100,8 @@ class ControllerSettings(Section):
     def rules(self) -> Rules:
         """Refuse gains of a joint where there is none."""
         alone = self.direct and self.mode == "computed_torque" and self.space == "so3"
-        allowed = "is a joint's: on so3 give bandwidth and damping_ratio"
-        yield alone, "stiffness", self.stiffness, allowed
+        requirement = "is a joint's: on so3 give bandwidth and damping_ratio"
+        yield alone, "stiffness", self.stiffness, requirement
         idle = self.direct and not any(self.stiffness) and self.integral_rate
         yield idle, "integral_rate", self.integral_rate, "acts on stiffness: give it"
 
@@ -112,12 +112,12 @@ class ControllerSettings(Section):
 
     @property
     def feeds(self) -> bool:
-        """Whether the torque of the desired motion is part of the command."""
+        """Whether the torque of the desired motion is fed forward."""
         return self.mode not in ("pd", "gravity_pd")
 
     @property
     def observes(self) -> bool:
-        """Whether the law needs the orientation at the measured angles."""
+        """Whether the law needs the orientation, observed by the measured angles."""
         return self.mode in ("gravity_pd", "computed_torque")
 
 
@@ -162,7 +162,8 @@ class ControlChannel(Section):
         if self.counts:
             gamma = triple(map(self.count, gamma))
             moved = axpy(1.0, gamma, -1.0, before)
-            gamma_dot, before = triple(part / self.period for part in moved), gamma
+            gamma_dot = triple(difference / self.period for difference in moved)
+            before = gamma
         if noise:
             gamma, gamma_dot = add(gamma, noise[:3]), add(gamma_dot, noise[3:])
         return gamma, gamma_dot, before
@@ -174,9 +175,13 @@ class ControlChannel(Section):
 
         `first` is 1 at the first sample, else 0.
         """
+        # At the first sample copies of the command fill the queue. A product chooses
+        # them, not a branch: in the loop of a batch `first` is a traced number.
         pairs = zip(command * self.delay, queue, strict=True)
-        line = (*(first * c + (1.0 - first) * q for c, q in pairs), *command)
-        return (line[0], line[1], line[2]), line[3:]
+        waiting = [first * sent + (1.0 - first) * queued for sent, queued in pairs]
+        line = (*waiting, *command)
+        acting = (line[0], line[1], line[2])
+        return acting, line[3:]
 
 
 @dataclass(frozen=True)
@@ -207,7 +212,7 @@ def is_above(value: Scalar) -> Scalar:
 def rotation_vector(quaternion: Quadruple) -> Triple:
     """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
     sign = 2.0 * is_above(quaternion[3]) - 1.0
-    x, y, z, w = (sign * part for part in quaternion)
+    x, y, z, w = (sign * component for component in quaternion)
     sine = gm.sqrt(x * x + y * y + z * z + 1e-300)
     factor = 2.0 * gm.atan2(sine, w) / sine
     return factor * x, factor * y, factor * z
@@ -248,15 +253,18 @@ class ControlLaw(NamedTuple):
         sum of errors [rad s], none without integral action. An `effort` [N m] is added
         to the feedforward.
         """
-        mode, feedback, summed = self.settings.mode, ZERO, ZERO
-        feedforward = torques[1] if self.settings.feeds else ZERO
+        mode = self.settings.mode
+        present_torque, held_torque = torques
+        feedforward = held_torque if self.settings.feeds else ZERO
+        feedback: Triple = ZERO
+        summed: Triple = ZERO  # what the integral sums
         error = axpy(1.0, desired.gamma, -1.0, gamma)
         rates = axpy(1.0, desired.gamma_dot, -1.0, gamma_dot)
         if mode == "gravity_pd":
             feedforward = self.torque(observed, ZERO, ZERO)
         if mode == "computed_torque":
-            asked = add(desired.gamma_ddot, self._correct(integral, error, rates))
-            moving = self.accelerate(*observed, *gamma_dot, *asked)
+            gamma_ddot = add(desired.gamma_ddot, self._correct(integral, error, rates))
+            moving = self.accelerate(*observed, *gamma_dot, *gamma_ddot)
             body_rate, acceleration = moving[:3], moving[3:]
             summed = error
             if self.settings.space == "so3":
@@ -264,18 +272,20 @@ class ControlLaw(NamedTuple):
                     desired, observed, body_rate, integral
                 )
             needed = self.torque(observed, body_rate, acceleration)
-            feedback = axpy(1.0, needed, -1.0, torques[0])
+            feedback = axpy(1.0, needed, -1.0, present_torque)
         elif mode != "feedforward":
             summed = error
             feedback = _by_joint(self.inertia, self._correct(integral, error, rates))
         if effort is not None:
             feedforward = add(feedforward, effort)
-        torque = total = add(feedforward, feedback)
-        weight: Scalar = 1.0
+        total = add(feedforward, feedback)
+        torque = total
+        weight: Scalar = 1.0  # 0 where the integral is frozen
         if self.limit is not None:
             torque = bound(total, self.limit)
             weight = 1.0 - is_above(gm.dot3(excess(total, self.limit), error))
-        integral = integral and axpy(1.0, integral, weight * self.period, summed)
+        if integral:
+            integral = axpy(1.0, integral, weight * self.period, summed)
         return Command(
             torque, feedforward, feedback, desired, error, rates, integral, total
         )
@@ -290,13 +300,16 @@ class ControlLaw(NamedTuple):
         rate = triple(gm.dot3(row, desired.body_rate) for row in turn)
         forward = triple(gm.dot3(row, desired.body_acceleration) for row in turn)
         moving = axpy(1.0, forward, -1.0, gm.cross3(body_rate, rate))
-        error, rates = self.turn(between), axpy(1.0, rate, -1.0, body_rate)
+        error = self.turn(between)
+        rates = axpy(1.0, rate, -1.0, body_rate)
         return error, add(moving, self._correct(integral, error, rates))
 
     def _correct(self, integral: Any, error: Triple, rates: Triple) -> Triple:
         """Acceleration kp e + kd e_dot, with integral action."""
-        leaning = axpy(1.0, error, self.integral_rate, integral) if integral else error
-        return add(_by_joint(self.kp, leaning), _by_joint(self.kd, rates))
+        error_and_sum = error
+        if integral:
+            error_and_sum = axpy(1.0, error, self.integral_rate, integral)
+        return add(_by_joint(self.kp, error_and_sum), _by_joint(self.kd, rates))
 
 
 def _by_joint(factors: Triple, values: Triple) -> Triple:
@@ -318,7 +331,8 @@ def feedback_gains(
             for name in ("stiffness", "damping")
         )
         return kp, kd
-    ones, bandwidth = np.ones_like(inertia), value("bandwidth")
+    ones = np.ones_like(inertia)
+    bandwidth = value("bandwidth")
     return ones * bandwidth**2, ones * (2.0 * value("damping_ratio") * bandwidth)
 
 

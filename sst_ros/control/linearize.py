@@ -98,10 +98,11 @@ class LinearModel(Explained, ReadOnly):
 
         Needs the package control.
         """
-        x, commands = list(self.states), [f"command_{k}" for k in (1, 2, 3)]
-        given = self.A, self.B, np.eye(len(x)), np.zeros_like(self.B), self.dt or 0
+        x = list(self.states)
+        commands = [f"command_{k}" for k in (1, 2, 3)]
+        system = self.A, self.B, np.eye(len(x)), np.zeros_like(self.B), self.dt or 0
         return require("control").StateSpace(
-            *given, states=x, outputs=x, inputs=commands
+            *system, states=x, outputs=x, inputs=commands
         )
 
 
@@ -116,10 +117,10 @@ def equilibrium(scene: SceneInput, gamma: Any) -> State:
         SingularConfiguration: no torques control the star there.
 
     """
-    there = with_initial(scene_of(scene), (gamma, ZERO))
-    y = start_of(there)
-    torque = InverseDynamics(there).gravity_torque(y[:4])
-    return State.of(0, y, Dynamics.of(there).joints(*y), torque)
+    scene_at_rest = with_initial(scene_of(scene), (gamma, ZERO))
+    y = start_of(scene_at_rest)
+    torque = InverseDynamics(scene_at_rest).gravity_torque(y[:4])
+    return State.of(0, y, Dynamics.of(scene_at_rest).joints(*y), torque)
 
 
 @check_kinds
@@ -153,35 +154,41 @@ def linearize(
         SingularConfiguration: a serial singularity; with "gamma" a parallel one, too.
 
     """
-    given, acting = scene_of(scene), finite_vector(torque)
-    limit, largest = given.torque_limit, max(map(abs, acting or ZERO))
+    scene = scene_of(scene)
+    acting = finite_vector(torque)
+    limit = scene.torque_limit
+    largest = max(map(abs, acting or ZERO))
     beyond = (
         f"must be at most {limit} N m, the torque limit: beyond it torques have no"
         " effect"
     )
     positive = isinstance(dt, (int, float)) and dt is not True and 0.0 < dt < math.inf
-    known = isinstance(coordinates, str) and coordinates in COORDINATES
+    is_defined = isinstance(coordinates, str) and coordinates in COORDINATES
     refuse_unless(
         "linearize",
         ("torque", torque, acting is not None, "must be three finite torques [N m]"),
         ("torque", torque, limit is None or largest <= limit, beyond),
         ("dt", dt, dt is None or positive, "must be a number > 0 [s]"),
-        ("coordinates", coordinates, known, "must be gamma or star"),
+        ("coordinates", coordinates, is_defined, "must be gamma or star"),
     )
     assert acting is not None
     if isinstance(state, State):
-        quaternion, rate, lagged = state.quaternion, state.body_rate, state.torque
+        quaternion = state.quaternion
+        rate = state.body_rate
+        lagged = state.torque
     else:
-        x, y, z, w, *body_rate = start_of(with_initial(given, state))
-        quaternion, rate, lagged = (x, y, z, w), triple(body_rate), acting
+        x, y, z, w, *body_rate = start_of(with_initial(scene, state))
+        quaternion = (x, y, z, w)
+        rate = triple(body_rate)
+        lagged = acting
     by_gamma = coordinates == "gamma"
     if by_gamma:
-        InverseDynamics(given).torque(quaternion, rate, ZERO)  # refuses singularities
-    dynamics = Dynamics.of(given)
-    by_star = None if by_gamma else trace_derivatives(given, (), by_torque=True)
-    now = np.array((*quaternion, *rate, *(lagged if given.lags else ())))
+        InverseDynamics(scene).torque(quaternion, rate, ZERO)  # refuses singularities
+    dynamics = Dynamics.of(scene)
+    by_star = None if by_gamma else trace_derivatives(scene, (), by_torque=True)
+    start_state = np.array((*quaternion, *rate, *(lagged if scene.lags else ())))
     try:
-        begin = _differentiate(dynamics, by_star, now, acting)
+        begin = _differentiate(dynamics, by_star, start_state, acting)
     except (ArithmeticError, ValueError):
         raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
     a, b = begin.A, begin.B
@@ -191,24 +198,24 @@ def linearize(
         with np.errstate(all="ignore"):  # of steps that are too long
             flow = follow_held_torque(
                 recent_ode(dynamics),
-                now.tolist(),
+                start_state.tolist(),
                 acting,
                 dt,
                 _MOST_PERIOD_EVALUATIONS,
-                elastic=given.stroke.at_end == "elastic",
+                elastic=scene.stroke.at_end == "elastic",
             )
         lasts = (
             "must be a period for which the motion lasts: it meets a singularity or is"
             " too long"
         )
         if flow is not None:
-            lasts = _find_limit(given, dynamics, flow, acting, dt)
+            lasts = _find_limit(scene, dynamics, flow, acting, dt)
         refuse_unless("linearize", ("dt", dt, not lasts, lasts))
         assert flow is not None
         to_x = _coordinates_by_state(dynamics, flow.states[-1], acting, by_gamma)
         a = to_x @ flow.by_start @ begin.y_by_x
         b = to_x @ flow.by_torque
-    lag = [f"torque_{k}" for k in (1, 2, 3)] if given.lags else []
+    lag = [f"torque_{k}" for k in (1, 2, 3)] if scene.lags else []
     states = (*COORDINATES[coordinates], *lag)
     return LinearModel(a, b, states, dt, bool(at_equilibrium))
 
@@ -296,7 +303,8 @@ def _turns(y: Array) -> tuple[Array, Array]:
 
     Shapes (n + 1, n) and (n, n + 1).
     """
-    size, q = len(y), y[:4]
+    size = len(y)
+    q = y[:4]
     by_axis = [quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]
     turn = np.array(by_axis).T
     from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)

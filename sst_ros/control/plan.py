@@ -128,10 +128,10 @@ def examine_motion(
     torque is defined there.
     """
     ends = pairwise(motion.pieces)
-    parts = (
+    piece_times = (
         np.linspace(begin, end, PIECE_PARTS, endpoint=False) for begin, end in ends
     )
-    times = np.concatenate([*parts, motion.pieces[-1:]])
+    times = np.concatenate([*piece_times, motion.pieces[-1:]])
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired, exact))
     limits = {
@@ -141,23 +141,29 @@ def examine_motion(
     }
     inverse = InverseDynamics(scene)
 
-    def measure(at: Reference) -> tuple[float, ...]:
+    def measure(reference: Reference) -> tuple[float, ...]:
         """Quantities of DEMAND_UNITS, each of three actuators."""
-        torque = inverse.reference_torque(at)
-        power = (x * rate for x, rate in zip(torque, at.gamma_dot, strict=True))
-        return (*torque, *power, *at.gamma_dot, *at.gamma_ddot)
+        torque = inverse.reference_torque(reference)
+        power = (x * rate for x, rate in zip(torque, reference.gamma_dot, strict=True))
+        return (*torque, *power, *reference.gamma_dot, *reference.gamma_ddot)
 
     def states(times: Array) -> Array:
         """Quaternions, body rates and torques of the motion, shape (n, 10)."""
-        found = map(motion.at, times.tolist())
+        references = map(motion.at, times.tolist())
         rows = [
-            (*at.quaternion, *at.body_rate, *inverse.reference_torque(at))
-            for at in found
+            (
+                *reference.quaternion,
+                *reference.body_rate,
+                *inverse.reference_torque(reference),
+            )
+            for reference in references
         ]
         return np.array(rows)
 
     samples, find = _sample(motion, measure, times, desired)
-    star = np.array([(*at.quaternion, *at.body_rate) for at in desired])
+    star = np.array(
+        [(*reference.quaternion, *reference.body_rate) for reference in desired]
+    )
     # ends of pieces may be equal up to rounding
     t, rows = np.unique(times, return_index=True)
     law = FunctionTorque(lambda time: inverse.reference_torque(motion.at(time)))
@@ -169,14 +175,16 @@ def examine_motion(
     for first, name in zip(range(0, 12, 3), DEMAND_UNITS, strict=True):
         floor = -math.inf if exact else limits.get(name, math.inf)
         legs = range(first, first + 3)
-        both = ([find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs)
-        peaks[name] = [max(ends, key=lambda peak: abs(peak.value)) for ends in both]
-    pieces = np.arange(0, len(times) - 1, PIECE_PARTS)[:, None] + np.arange(
+        extremes = (
+            [find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs
+        )
+        peaks[name] = [max(pair, key=lambda peak: abs(peak.value)) for pair in extremes]
+    piece_rows = np.arange(0, len(times) - 1, PIECE_PARTS)[:, None] + np.arange(
         PIECE_PARTS + 1
     )
-    squares = simpson(samples[pieces, :3] ** 2, x=times[pieces][..., None], axis=1).sum(
-        axis=0
-    )
+    squares = simpson(
+        samples[piece_rows, :3] ** 2, x=times[piece_rows][..., None], axis=1
+    ).sum(axis=0)
     rms = np.sqrt(squares / times[-1]).tolist()
     faults = tuple(_faults(distances, peaks, limits))
     return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
@@ -198,10 +206,10 @@ def _sample(
 
     def find(index: int, sign: float, floor: float) -> Peak:
         values = sign * samples[:, index]
-        found = maximum(
+        extreme = maximum(
             lambda time: sign * measure(motion.at(time))[index], times, values, floor
         )
-        return Peak(sign * found.value, found.time)
+        return Peak(sign * extreme.value, extreme.time)
 
     return samples, find
 
@@ -231,14 +239,14 @@ def maximum(
     for index in np.flatnonzero((values >= left) & (values >= right) & high):
         bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
         options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
-        found = minimize_scalar(
+        refined = minimize_scalar(
             lambda time: -function(time),
             bounds=bounds,
             method="bounded",
             options=options,
         )
-        if -found.fun > best.value + _LIMIT_ROUNDING * abs(best.value):
-            best = Peak(float(-found.fun), float(found.x))
+        if -refined.fun > best.value + _LIMIT_ROUNDING * abs(best.value):
+            best = Peak(float(-refined.fun), float(refined.x))
     return best
 
 
@@ -252,45 +260,51 @@ def _distances(
     geometry = Geometry.of(scene)
     space = ActuatorSpaceMap(geometry)
 
-    def measure(at: Reference) -> tuple[float, ...]:
+    def measure(reference: Reference) -> tuple[float, ...]:
         """Gamma, sin(mu), beta and det J2, ten numbers.
 
         sin(mu) < 0 beyond a serial singularity.
         """
-        posture = list(space.posture(*at.quaternion))
-        turned = space.of_star(at.quaternion, at.body_rate, at.body_acceleration).gamma
+        posture = list(space.posture(*reference.quaternion))
+        turned = space.of_star(
+            reference.quaternion, reference.body_rate, reference.body_acceleration
+        ).gamma
         for leg in range(3):
             # On the other branch of the leg r_k has the opposite direction: gamma
             # differs by pi.
-            if math.cos(at.gamma[leg] - turned[leg]) < 0.0:
+            if math.cos(reference.gamma[leg] - turned[leg]) < 0.0:
                 posture[leg] = -posture[leg]
-        return (*at.gamma, *posture)
+        return (*reference.gamma, *posture)
 
     samples, find = _sample(motion, measure, times, desired)
 
-    def reach(index: int, end: float, sign: float, held: bool = True) -> Peak:
-        """Return the value closest to a limit, or farthest beyond."""
-        floor = -math.inf if exact else -sign * end if held else math.inf
+    def reach(index: int, end: float, sign: float, enforced: bool = True) -> Peak:
+        """Return the value closest to a limit, or farthest beyond.
+
+        Beyond a limit that is not `enforced` a motion is not refused.
+        """
+        floor = -math.inf
+        if not exact:
+            floor = -sign * end if enforced else math.inf
         return find(index, -sign, floor)
 
-    arcs, edges = geometry.arc.tolist(), [geometry.beta_max] * 3
-    in_stroke, in_workspace = (
-        scene.stroke.at_end != "ignore",
-        scene.workspace.at_edge != "ignore",
-    )
+    arcs = geometry.arc.tolist()
+    edges = [geometry.beta_max] * 3
+    in_stroke = scene.stroke.at_end != "ignore"
+    in_workspace = scene.workspace.at_edge != "ignore"
     ranges = ("gamma", 0, arcs, in_stroke), ("beta", 6, edges, in_workspace)
-    for name, first, ends, held in ranges:
+    for name, first, ends, enforced in ranges:
         for leg, most in enumerate(ends):
             for end, sign in ((0.0, 1.0), (most, -1.0)):
-                reached = reach(first + leg, end, sign, held)
+                reached = reach(first + leg, end, sign, enforced)
                 yield LimitDistance(
-                    f"{name}_{leg + 1}", end, sign, "rad", reached, held
+                    f"{name}_{leg + 1}", end, sign, "rad", reached, enforced
                 )
     for leg in (1, 2, 3):
         low = reach(2 + leg, SINGULAR_MU, 1.0)
         if low.value < SINGULAR_MU:
-            said = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
-            raise SingularConfiguration(said, low.value)
+            cause = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
+            raise SingularConfiguration(cause, low.value)
         yield LimitDistance(f"sin(mu_{leg})", 0.0, 1.0, "1", low, True)
 
     def determinant(time: float) -> float:
@@ -301,8 +315,8 @@ def _distances(
     if sign * nearest.value < SINGULAR_J2:
         crosses = sign * nearest.value <= 0.0
         time = brentq(determinant, 0.0, nearest.time) if crosses else nearest.time
-        said = f"parallel singularity at t = {time:.9g} s, det J2"
-        raise SingularConfiguration(said, determinant(time))
+        cause = f"parallel singularity at t = {time:.9g} s, det J2"
+        raise SingularConfiguration(cause, determinant(time))
     yield LimitDistance("det J2", 0.0, sign, "1", nearest, True)
 
 
@@ -311,18 +325,20 @@ def _faults(
     peaks: dict[str, list[Peak]],
     limits: dict[str, float],
 ) -> Iterator[Problem]:
-    for one in distances:
-        if one.refused and one.least < 0.0:
-            side = f"{one.side} {one.end:.9g} {one.unit} (t = {one.reached.time:.9g} s)"
-            yield Problem(one.key, one.reached.value, f"must stay {side}")
+    for distance in distances:
+        if distance.refused and distance.least < 0.0:
+            reached = distance.reached
+            limit_text = f"{distance.side} {distance.end:.9g} {distance.unit}"
+            requirement = f"must stay {limit_text} (t = {reached.time:.9g} s)"
+            yield Problem(distance.key, reached.value, requirement)
     for name, limit in limits.items():
         for leg, peak in enumerate(peaks[name], start=1):
             if abs(peak.value) > limit:
-                allowed = (
+                requirement = (
                     f"exceeds the limit {limit:g} {DEMAND_UNITS[name]} at t ="
                     f" {peak.time:.9g} s"
                 )
-                yield Problem(f"{name}_{leg}", peak.value, allowed)
+                yield Problem(f"{name}_{leg}", peak.value, requirement)
 
 
 @dataclass(frozen=True)
@@ -347,12 +363,13 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
     feasible range narrower than the grid, between others that are not, may be
     overlooked.
     """
-    known, torque_limit = plan.limits, plan.trajectory.scene.torque_limit
+    limits = plan.limits
+    torque_limit = plan.trajectory.scene.torque_limit
     caps = {"": math.inf}
     for name, power in (("velocity", 1.0), ("acceleration", 0.5)):
         largest = max(abs(peak.value) for peak in plan.peaks[name])
-        if name in known and largest:
-            caps[name] = (known[name] / largest) ** power
+        if name in limits and largest:
+            caps[name] = (limits[name] / largest) ** power
     highest, binding = min((cap, name) for name, cap in caps.items())
     if torque_limit is None:
         return TimeScaling(highest, 0.0, binding)
@@ -379,20 +396,22 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
 
     <= 0 for none.
     """
-    scene, times = plan.trajectory.scene, plan.trajectory.t
-    model, inverse = kernel.model_of(scene), InverseDynamics(scene)
+    scene = plan.trajectory.scene
+    times = plan.trajectory.t
+    model = kernel.model_of(scene)
+    inverse = InverseDynamics(scene)
     quaternion, rate = plan.trajectory.quaternion.T, plan.trajectory.body_rate.T
     acceleration = np.array(
         [plan.motion.at(time).body_acceleration for time in times.tolist()]
     ).T
 
     def torque(factor: float, leg: int, sign: float, time: float) -> float:
-        at = plan.motion.at(time)
+        reference = plan.motion.at(time)
         moving = (
-            multiply(factor, at.body_rate),
-            multiply(factor * factor, at.body_acceleration),
+            multiply(factor, reference.body_rate),
+            multiply(factor * factor, reference.body_acceleration),
         )
-        return sign * inverse.torque(at.quaternion, *moving)[leg]
+        return sign * inverse.torque(reference.quaternion, *moving)[leg]
 
     def excess(factor: float) -> float:
         moving: Any = [tuple(factor * rate), tuple(factor * factor * acceleration)]
@@ -401,8 +420,8 @@ def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
         largest = float(np.abs(sampled).max())
         for leg, sign in product(range(3), (1.0, -1.0)):
             if largest <= limit:  # not above it yet
-                at = partial(torque, factor, leg, sign)
-                peak = maximum(at, times, sign * sampled[leg], limit)
+                signed_torque = partial(torque, factor, leg, sign)
+                peak = maximum(signed_torque, times, sign * sampled[leg], limit)
                 largest = max(largest, peak.value)
         return largest - limit
 
@@ -429,14 +448,14 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
     reactions = {
         name: {
-            size: {part: value.tolist() for part, value in one._asdict().items()}
-            for size, one in figures.items()
+            size: {figure: value.tolist() for figure, value in loads._asdict().items()}
+            for size, loads in figures.items()
         }
         for name, figures in examine_reactions(plan).items()
     }
     highest = fastest.highest
     any_speed = highest is not None and math.isinf(highest)
-    found = {
+    plan_document = {
         "scene": plan.trajectory.scene.name,
         "duration": plan.motion.duration,
         "feasible": not plan.problems,
@@ -448,13 +467,15 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
             for leg in range(3)
         ],
         "reactions": reactions,
-        "distances": [{**asdict(one), "least": one.least} for one in plan.distances],
+        "distances": [
+            {**asdict(distance), "least": distance.least} for distance in plan.distances
+        ],
         "highest_speed": None if any_speed else highest,
         "any_speed": any_speed,
         "lowest_speed": fastest.lowest,
         "binding": fastest.binding,
     }
-    return json.dumps(found, indent=2)
+    return json.dumps(plan_document, indent=2)
 
 
 def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
@@ -467,6 +488,8 @@ def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
     count = math.ceil(motion.duration / period - 1e-9)
     lines = ["time,tau_1,tau_2,tau_3"]
     for k in range(count + 1):
-        at = motion.at((k + 0.5) * period if k < count else math.inf)
-        lines.append(",".join(map(repr, (k * period, *inverse.reference_torque(at)))))
+        reference = motion.at((k + 0.5) * period if k < count else math.inf)
+        lines.append(
+            ",".join(map(repr, (k * period, *inverse.reference_torque(reference))))
+        )
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

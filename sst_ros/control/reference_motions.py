@@ -85,12 +85,12 @@ def reference_motion(
     if motion.recorded:
         bag = motion.recorded.bag
         if read_motion is None:
-            allowed = "a recorded motion cannot be read here"
-            raise refusal(scene.name, "motion.recorded", bag, allowed)
-        found = read_motion(bag, motion.recorded.namespace)
-        x, y, z, w = found.quaternion[0].tolist()
+            requirement = "a recorded motion cannot be read here"
+            raise refusal(scene.name, "motion.recorded", bag, requirement)
+        trajectory = read_motion(bag, motion.recorded.namespace)
+        x, y, z, w = trajectory.quaternion[0].tolist()
         return through_samples(
-            geometry, (x, y, z, w), found.t, found.gamma, found.gamma_dot
+            geometry, (x, y, z, w), trajectory.t, trajectory.gamma, trajectory.gamma_dot
         )
     gamma = scene.initial.gamma
     x, y, z, w = initial_state(scene, geometry)[:4]
@@ -101,7 +101,8 @@ def reference_motion(
         return spiral_motion(geometry, start, motion.spiral)
     if motion.waypoints:
         points = [
-            (at.time, at.gamma, at.gamma_dot, at.gamma_ddot) for at in motion.waypoints
+            (point.time, point.gamma, point.gamma_dot, point.gamma_ddot)
+            for point in motion.waypoints
         ]
         try:
             return through_points(geometry, start, *zip(*points, strict=True))
@@ -144,11 +145,11 @@ def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, floa
     It is at rest at both ends. Its two derivatives by time are returned with it.
     """
     u = time / duration
-    rest, square = 1.0 - u, u * u
+    remaining, square = 1.0 - u, u * u
     return (
         square * u * (10.0 + u * (6.0 * u - 15.0)),
-        30.0 * square * rest * rest / duration,
-        60.0 * u * rest * (rest - u) / (duration * duration),
+        30.0 * square * remaining * remaining / duration,
+        60.0 * u * remaining * (remaining - u) / (duration * duration),
     )
 
 
@@ -201,8 +202,8 @@ def _on_geodesic(
 ) -> tuple[Quaternion, Vector3, Vector3]:
     """Return what `StarPath` says, of a turn about one axis."""
     half = 0.5 * s * angle
-    part = math.sin(half) / angle if angle else 0.0
-    return (*multiply(part, vector), math.cos(half)), vector, ZERO
+    factor = math.sin(half) / angle if angle else 0.0
+    return (*multiply(factor, vector), math.cos(half)), vector, ZERO
 
 
 def spiral_motion(
@@ -224,12 +225,10 @@ def _on_spiral(
 ) -> tuple[Quaternion, Vector3, Vector3]:
     """Return what `StarPath` says, of `spiral_motion`."""
     third = psi - theta
-    b, c, difference, total = (
-        s * phi,
-        s * third,
-        0.5 * s * (third - theta),
-        0.5 * s * psi,
-    )
+    b = s * phi
+    c = s * third
+    difference = 0.5 * s * (third - theta)
+    total = 0.5 * s * psi
     sine, cosine = math.sin(0.5 * b), math.cos(0.5 * b)
     x, y = sine * math.sin(difference), sine * math.cos(difference)
     q = x, y, cosine * math.sin(total), cosine * math.cos(total)
@@ -245,7 +244,10 @@ def _on_spiral(
 
 
 def move_actuators(
-    geometry: Geometry, path: ActuatorPath, pieces: tuple[float, ...], start: Quaternion
+    geometry: Geometry,
+    path: ActuatorPath,
+    piece_ends: tuple[float, ...],
+    start: Quaternion,
 ) -> ReferenceMotion:
     """Return a motion of the actuators, with the orientation along it.
 
@@ -257,24 +259,25 @@ def move_actuators(
     InputError where a piece is longer than LONGEST_PIECE, AssemblyError where it does
     not begin at that orientation.
     """
-    space, times = ActuatorSpaceMap(geometry), _space(path, pieces)
+    space = ActuatorSpaceMap(geometry)
+    times = _choose_times(path, piece_ends)
     gammas = [path(time)[0] for time in times]
     try:
         rotations, sigmas = continuation.follow(
             geometry, gammas, rotation_matrix(start)
         )
     except continuation.BranchEnds as error:
-        said = f"parallel singularity before t = {times[error.row]:.9g} s"
+        cause = f"parallel singularity before t = {times[error.row]:.9g} s"
         raise SingularConfiguration(
-            f"{said}, least singular value of J2", error.measure
+            f"{cause}, least singular value of J2", error.measure
         ) from error
     quaternions = quaternion_of(rotations)
     # Their signs change as little as they can.
     turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
     signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))
-    known = map(tuple, (signs[:, None] * quaternions).tolist())
-    kept = list(zip(times, known, gammas, sigmas.tolist(), strict=True))
-    return ReferenceMotion(partial(_on_path, space, path, kept), pieces)
+    orientations = map(tuple, (signs[:, None] * quaternions).tolist())
+    kept = list(zip(times, orientations, gammas, sigmas.tolist(), strict=True))
+    return ReferenceMotion(partial(_on_path, space, path, kept), piece_ends)
 
 
 def _on_path(
@@ -286,31 +289,32 @@ def _on_path(
     value of J2.
     """
     gamma, gamma_dot, gamma_ddot = path(time)
-    _, known, here, sigma = kept[
+    _, kept_quaternion, kept_gamma, sigma = kept[
         max(bisect_right(kept, time, key=itemgetter(0)) - 1, 0)
     ]
-    q = space.follow(known, here, gamma, sigma)
+    q = space.follow(kept_quaternion, kept_gamma, gamma, sigma)
     star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
     return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
 
 
-def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
+def _choose_times(path: ActuatorPath, piece_ends: tuple[float, ...]) -> list[float]:
     """Return times between which gamma moves by no more than KEPT_STEP.
 
     The first and the last time are among them.
     """
     times = [np.zeros(1)]
-    for begin, end in pairwise(pieces):
+    for begin, end in pairwise(piece_ends):
         rough = [
             path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()
         ]
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
-        allowed = (
+        requirement = (
             f"must be less than {LONGEST_PIECE:g} rad"
             f" between {begin:.9g} s and {end:.9g} s"
         )
         refuse_unless(
-            "motion", ("path length of gamma", length, length < LONGEST_PIECE, allowed)
+            "motion",
+            ("path length of gamma", length, length < LONGEST_PIECE, requirement),
         )
         count = max(_SAMPLES, math.ceil(4.0 * length / KEPT_STEP))
         times.append(np.linspace(begin, end, count + 1)[1:])
@@ -319,24 +323,26 @@ def _space(path: ActuatorPath, pieces: tuple[float, ...]) -> list[float]:
     passed = np.cumsum(np.linalg.norm(np.diff(gammas, axis=0), axis=1))
     # The first of each half a KEPT_STEP of the path.
     _, kept = np.unique(np.append(0.0, passed) // (0.5 * KEPT_STEP), return_index=True)
-    return [*fine[kept].tolist(), pieces[-1]]
+    return [*fine[kept].tolist(), piece_ends[-1]]
 
 
 def _sweep_path(
     sweep: Sweep, centre: Vector3
 ) -> tuple[ActuatorPath, tuple[float, ...]]:
     """Sines that fade in and out, and pieces of a quarter of a period or less."""
-    last, fade, duration = (
-        sweep.last_frequency or sweep.frequency,
-        sweep.fade,
-        sweep.duration,
-    )
+    last = sweep.last_frequency or sweep.frequency
+    fade = sweep.fade
+    duration = sweep.duration
     slopes = [(b - a) / duration for a, b in zip(sweep.frequency, last, strict=True)]
     rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
     fastest = max(map(abs, (*sweep.frequency, *last)))
     quarters = math.ceil(fastest * duration / (0.5 * math.pi))
-    pieces = {*equal_pieces(duration, max(quarters, 2 * PIECES)), fade, duration - fade}
-    return partial(_on_sines, rows, fade, duration), tuple(sorted(pieces))
+    piece_ends = {
+        *equal_pieces(duration, max(quarters, 2 * PIECES)),
+        fade,
+        duration - fade,
+    }
+    return partial(_on_sines, rows, fade, duration), tuple(sorted(piece_ends))
 
 
 def _on_sines(
@@ -384,28 +390,34 @@ def through_points(
         ("points", len(times), len(times) > 0, "must be one or more")
     ]
     names = "times", "positions", "velocities", "accelerations"
-    given = [[time] for time in times], positions, velocities, accelerations
+    columns = [[time] for time in times], positions, velocities, accelerations
     rows = [
-        _read_rows(*one, len(times), checks) for one in zip(names, given, strict=True)
+        _read_rows(name, column, len(times), checks)
+        for name, column in zip(names, columns, strict=True)
     ]
     refuse_unless("trajectory", *checks)
-    at, gamma, rates, seconds = map(np.array, rows)
-    at = at.ravel()
-    refuse_unless("trajectory", *_check_points(at, rates))
-    here = kinematics.inverse(geometry, rotation_matrix(start))[0]
-    if at[0] > 0.0:
-        at, gamma = np.append(0.0, at), np.vstack([here, gamma])
-        rates, seconds = np.vstack([begin[0], rates]), np.vstack([begin[1], seconds])
-    allowed = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
-    first, near = gamma[0].tolist(), np.abs(gamma[0] - here).max() <= NEAR
+    point_times, gamma, rates, seconds = map(np.array, rows)
+    point_times = point_times.ravel()
+    refuse_unless("trajectory", *_check_points(point_times, rates))
+    start_gamma = kinematics.inverse(geometry, rotation_matrix(start))[0]
+    if point_times[0] > 0.0:
+        begin_rate, begin_acceleration = begin
+        point_times = np.append(0.0, point_times)
+        gamma = np.vstack([start_gamma, gamma])
+        rates = np.vstack([begin_rate, rates])
+        seconds = np.vstack([begin_acceleration, seconds])
+    requirement = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
+    first = gamma[0].tolist()
+    is_near = np.abs(gamma[0] - start_gamma).max() <= NEAR
     refuse_unless(
-        "trajectory", ("positions[0]", first, near, allowed.format(NEAR, *here))
+        "trajectory",
+        ("positions[0]", first, is_near, requirement.format(NEAR, *start_gamma)),
     )
     for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
         ends[np.isnan(ends)] = 0.0
-    begun = follow_assembly(geometry, start, here, gamma[0])
-    path = partial(_on_curve, quintic(at, gamma, rates, seconds))
-    return move_actuators(geometry, path, tuple(at.tolist()), begun)
+    begun = follow_assembly(geometry, start, start_gamma, gamma[0])
+    path = partial(_on_curve, quintic(point_times, gamma, rates, seconds))
+    return move_actuators(geometry, path, tuple(point_times.tolist()), begun)
 
 
 def through_samples(
@@ -424,11 +436,11 @@ def through_samples(
     Raises as `move_actuators`.
     """
     times, gamma = times - times[0], np.unwrap(positions, axis=0)
-    pieces = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
+    piece_ends = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
     path = partial(
         _on_curve, quintic(times, gamma, velocities, np.full_like(gamma, np.nan))
     )
-    return move_actuators(geometry, path, pieces, start)
+    return move_actuators(geometry, path, piece_ends, start)
 
 
 def _read_rows(
@@ -439,37 +451,44 @@ def _read_rows(
     What they must be joins the checks.
     """
     rows = [None] * count if rows is None else rows
-    whole = f"must have a row for each of {count} points"
-    checks.append((name, len(rows), len(rows) == count, whole))
-    size, allowed = (
-        (1, "must be finite") if name == "times" else (3, "must be 3 finite numbers")
-    )
-    found = [[] if row is None else list(map(float, row)) for row in rows]
-    for index, numbers in enumerate(found):
+    rows_requirement = f"must have a row for each of {count} points"
+    checks.append((name, len(rows), len(rows) == count, rows_requirement))
+    size = 3
+    requirement = "must be 3 finite numbers"
+    if name == "times":
+        size = 1
+        requirement = "must be finite"
+    numbers_by_row = [[] if row is None else list(map(float, row)) for row in rows]
+    for index, numbers in enumerate(numbers_by_row):
         if not numbers and name in ("velocities", "accelerations"):
             numbers += [math.nan] * size
         else:
             good = len(numbers) == size and all(map(math.isfinite, numbers))
-            checks.append((f"{name}[{index}]", numbers, good, allowed))
-    return found
+            checks.append((f"{name}[{index}]", numbers, good, requirement))
+    return numbers_by_row
 
 
-def _check_points(at: Array, rates: Array) -> Iterator[Check]:
+def _check_points(point_times: Array, rates: Array) -> Iterator[Check]:
     """Yield what points of finite numbers must be."""
-    for index in np.flatnonzero(at[1:] <= at[:-1]) + 1:
-        allowed = f"must be > {at[index - 1]:g} s, that of the point before"
-        yield f"times[{index}]", float(at[index]), False, allowed
-    early = at[0] < 0.0 or (at[0] == 0.0 and len(at) == 1)
+    for index in np.flatnonzero(point_times[1:] <= point_times[:-1]) + 1:
+        requirement = (
+            f"must be > {point_times[index - 1]:g} s, that of the point before"
+        )
+        yield f"times[{index}]", float(point_times[index]), False, requirement
+    early = point_times[0] < 0.0 or (point_times[0] == 0.0 and len(point_times) == 1)
     yield (
         "times[0]",
-        float(at[0]),
+        float(point_times[0]),
         not early,
         "must be >= 0 s, that of a single point > 0 s",
     )
-    for end in {0, len(at) - 1} if at[0] == 0.0 else {len(at) - 1}:
+    rows_at_rest = {len(point_times) - 1}
+    if point_times[0] == 0.0:
+        rows_at_rest.add(0)
+    for end in sorted(rows_at_rest):
         still = not np.nan_to_num(rates[end]).any()
-        allowed = "must be zero: a motion begins and ends at rest"
-        yield f"velocities[{end}]", rates[end].tolist(), still, allowed
+        requirement = "must be zero: a motion begins and ends at rest"
+        yield f"velocities[{end}]", rates[end].tolist(), still, requirement
 
 
 def _on_curve(curve: PPoly, time: float) -> tuple[Vector3, Vector3, Vector3]:
@@ -491,9 +510,9 @@ def quintic(
     Times of the points rise [s], shape (n,), n >= 2; the numbers there have shape (n,
     m), NaN where a velocity or an acceleration is left open.
     """
-    at = np.asarray(times, dtype=float)
+    point_times = np.asarray(times, dtype=float)
     nodes = np.stack([positions, velocities, accelerations], axis=1).astype(float)
-    lengths = np.diff(at)
+    lengths = np.diff(point_times)
     _complete(nodes, lengths)
     # derivatives by the time of a segment, from 0 to 1
     powers = lengths[:, None] ** np.arange(6)
@@ -501,10 +520,12 @@ def quintic(
         np.concatenate([nodes[:-1], nodes[1:]], axis=1) * powers[:, [0, 1, 2] * 2, None]
     )
     unit = PPoly.from_bernstein_basis(_UNIT_QUINTIC).c[:, 0]
-    path = PPoly(np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None], at)
-    parts = [path.derivative(order).c for order in range(3)]
-    padded = [np.pad(c, ((6 - len(c), 0), (0, 0), (0, 0))) for c in parts]
-    return PPoly(np.stack(padded, axis=2), at)
+    path = PPoly(
+        np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None], point_times
+    )
+    derivatives = [path.derivative(order).c for order in range(3)]
+    padded = [np.pad(c, ((6 - len(c), 0), (0, 0), (0, 0))) for c in derivatives]
+    return PPoly(np.stack(padded, axis=2), point_times)
 
 
 def _complete(nodes: Array, lengths: Array) -> None:

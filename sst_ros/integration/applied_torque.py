@@ -62,15 +62,16 @@ class AppliedTorque:
     """
 
     def __init__(self, dynamics: Dynamics, limit: float | None) -> None:
-        self._dynamics, self.limit = dynamics, limit
+        self._dynamics = dynamics
+        self.limit = limit
         self._lags = len(dynamics.state) > 7
 
     def acting(self, torque: Torque) -> Torque:
         """Return what acts: torques that are held within the limit, others as given."""
-        held = torque.held if isinstance(torque, TorqueProfile) else torque
-        if held is None:
+        constant_torque = torque.held if isinstance(torque, TorqueProfile) else torque
+        if constant_torque is None:
             return torque
-        first, second, third = map(float, held)
+        first, second, third = map(float, constant_torque)
         return clamp((first, second, third), self.limit)
 
     def limit_of(self, torque: SineTorque) -> float | None:
@@ -192,11 +193,12 @@ class AppliedTorque:
         The difference is forward from `torque`, as a step may begin at a kink, behind
         which the torque has another rate.
         """
-        near, far = (
+        torque_after_one, torque_after_two = (
             np.array(self.of_drive(drive, t + k * _TIME_STEP, y)) for k in (1, 2)
         )
         return np.asarray(
-            (4.0 * near - far - 3.0 * np.array(torque)) / (2.0 * _TIME_STEP)
+            (4.0 * torque_after_one - torque_after_two - 3.0 * np.array(torque))
+            / (2.0 * _TIME_STEP)
         )
 
     def by_state(

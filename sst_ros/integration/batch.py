@@ -117,14 +117,20 @@ class Batch(Explained):
         unused = (
             _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
         )
-        given = {key: unused.get(key.partition(".")[0], "") for key in parameters or ()}
+        requirements = {
+            key: unused.get(key.partition(".")[0], "") for key in parameters or ()
+        }
         torque = not profile or scene.torque is not None
         refuse_unless(
             scene.name,
-            *((key, "given", not allowed, allowed) for key, allowed in given.items()),
+            *(
+                (key, "given", not requirement, requirement)
+                for key, requirement in requirements.items()
+            ),
             ("torque", None, torque, "must be given in the scene for its profile"),
         )
-        self.scene, self._method = scene, method
+        self.scene = scene
+        self._method = method
         self._scenarios = Scenarios(scene, parameters or {})
         self._scenarios.check()
         self.model = ParametricModel(self._scenarios, profile=profile)
@@ -160,10 +166,11 @@ class Batch(Explained):
         The scenarios are already checked. Numbers that do not differ in this batch must
         not differ in that.
         """
-        other = Batch.__new__(Batch)  # a copy would trace its programs again
-        vars(other).update(vars(self))
-        other._scenarios, other.columns = scenarios, self.model.columns(scenarios)
-        return other
+        batch = Batch.__new__(Batch)  # a copy would trace its programs again
+        vars(batch).update(vars(self))
+        batch._scenarios = scenarios
+        batch.columns = self.model.columns(scenarios)
+        return batch
 
     @check_kinds
     def scenario(self, row: int) -> Scene:
@@ -204,40 +211,43 @@ class Batch(Explained):
             InputError: an argument is not allowed; names it and what is.
 
         """
-        allowed = f"must be >= 0 and <= {_MOST_BATCH_STEPS:g}"
-        whole = {"count": count, "keep_every": keep_every, "threads": threads}
+        requirement = f"must be >= 0 and <= {_MOST_BATCH_STEPS:g}"
+        whole_numbers = {"count": count, "keep_every": keep_every, "threads": threads}
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
             *(
-                (name, n, 0 <= n <= _MOST_BATCH_STEPS, allowed)
-                for name, n in whole.items()
+                (name, n, 0 <= n <= _MOST_BATCH_STEPS, requirement)
+                for name, n in whole_numbers.items()
             ),
         )
-        step, count = float(step), int(count)
+        step = float(step)
+        count = int(count)
         loop = advance or partial(self.advance, threads=threads)
         y, code = self.initial(gamma, gamma_dot)
         number = y.shape[1]
-        given = self.drives(torque, number)
-        time, error = np.full(number, np.nan), np.zeros(number)
-        kept, ends = [y.copy()], [0]
+        drives = self.drives(torque, number)
+        time = np.full(number, np.nan)
+        error = np.zeros(number)
+        kept = [y.copy()]
+        ends = [0]
         # few calls: each passes all rows
         size = keep_every or (0 if progress else max(count, 1))
-        for part in slices(count, size, self.scene.name, progress):
-            span = part.stop - part.start
-            loop(part.start, span, step, y, given, code, time, error, rows=None)
+        for step_range in slices(count, size, self.scene.name, progress):
+            span = step_range.stop - step_range.start
+            loop(step_range.start, span, step, y, drives, code, time, error, rows=None)
             if keep_every and span == keep_every:
                 kept.append(y.copy())
-                ends.append(part.stop)
+                ends.append(step_range.stop)
         time[code < 0] = 0.0
         # A step in which a limit was passed is left out: its beginning is the last
         # valid state.
         begins = np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
         steps = np.where(code > 0, begins, count)
         steps[code < 0] = 0
-        locate_ends(loop, step, steps, y, given, code, time)
+        locate_ends(loop, step, steps, y, drives, code, time)
         last = steps * step
-        facts = self.model, self.columns, given[:3].T, code, time, error
+        facts = self.model, self.columns, drives[:3].T, code, time, error
         result = BatchResult(*facts, last, y)
         if keep_every:
             samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
@@ -275,12 +285,12 @@ class Batch(Explained):
                 torques.
 
         """
-        allowed = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
+        requirement = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
         torque = self.model.ode.drive[:3] == TORQUE_SYMBOLS
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
-            ("substeps", substeps, 1 <= substeps <= _MOST_BATCH_STEPS, allowed),
+            ("substeps", substeps, 1 <= substeps <= _MOST_BATCH_STEPS, requirement),
             (
                 "profile",
                 True,
@@ -312,29 +322,33 @@ class Batch(Explained):
         )
         angles = _rows("gamma", gamma, 1 if alike and count else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
-        which = columns.geometry
-        if rows is not None and len(which) > 1:
-            which = which[rows]
-        which = np.broadcast_to(which[: len(angles)], len(angles))
-        start, code = initial_states(columns.geometries, which, angles, rates)
+        geometry_rows = columns.geometry
+        if rows is not None and len(geometry_rows) > 1:
+            geometry_rows = geometry_rows[rows]
+        geometry_rows = np.broadcast_to(geometry_rows[: len(angles)], len(angles))
+        start, code = initial_states(columns.geometries, geometry_rows, angles, rates)
         if self.scene.stroke.at_end == "stop":
-            outside = (angles < 0.0) | (angles > columns.geometries.of_rows(which).arc)
+            outside = (angles < 0.0) | (
+                angles > columns.geometries.of_rows(geometry_rows).arc
+            )
             code[outside.any(axis=1)] = OUTSIDE_STATUS
         y = np.zeros((len(self.model.ode.state), len(angles)))
         y[:7] = start
         if alike and count:
-            y, code = np.repeat(y, count, axis=1), np.repeat(code, count)
+            y = np.repeat(y, count, axis=1)
+            code = np.repeat(code, count)
         return y, code
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
         """Return what acts from outside and what differs, a column a scenario."""
-        drive, columns = self.model.ode.drive, self.columns.inputs
-        given = np.zeros((max(len(drive) + len(columns), 1), number))
+        drive = self.model.ode.drive
+        columns = self.columns.inputs
+        drive_rows = np.zeros((max(len(drive) + len(columns), 1), number))
         if drive[:3] == TORQUE_SYMBOLS:
             limit = self.columns.torque_limit
-            given[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
-        given[len(drive) : len(drive) + len(columns)] = columns
-        return given
+            drive_rows[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
+        drive_rows[len(drive) : len(drive) + len(columns)] = columns
+        return drive_rows
 
     def advance(
         self,
@@ -359,14 +373,16 @@ class Batch(Explained):
         width = block_width(number, threads)
         begins = range(0, number, width)
         size = max(1, -(-len(begins) // (1 if threads == 1 else 4 * threads)))
-        parts = [begins[i : i + size] for i in range(0, len(begins), size)]
+        thread_shares = [begins[i : i + size] for i in range(0, len(begins), size)]
 
         programs = self.programs  # compiled here, not by each thread
 
-        def work(part: range) -> None:
-            advance_blocks(Block(programs, width), part, first, count, step, *columns)
+        def advance_share(block_begins: range) -> None:
+            advance_blocks(
+                Block(programs, width), block_begins, first, count, step, *columns
+            )
 
-        deque(run_many(work, parts, workers=threads), maxlen=0)
+        deque(run_many(advance_share, thread_shares, workers=threads), maxlen=0)
 
     @cached_property
     def programs(self) -> ColumnStep:
@@ -439,14 +455,19 @@ class BatchResult(MotionTable):
         t: Array,  # shape (N,) or (samples, N)
         y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
     ) -> None:
-        self._model, self._columns, self._torque = model, columns, torque
+        self._model = model
+        self._columns = columns
+        self._torque = torque
         self.scene = model.scene
         self._axes = ("time", "scenario") if t.ndim == 2 else ("scenario",)
-        self.code, self.fault_time, self.local_error = code, fault_time, local_error
+        self.code = code
+        self.fault_time = fault_time
+        self.local_error = local_error
         self.status = np.where(
             (code < 0) | (code == NOT_FINITE_CODE), -1, np.sign(code)
         )
-        self.t, self._state = t, np.moveaxis(y, -2, -1)
+        self.t = t
+        self._state = np.moveaxis(y, -2, -1)
         self.quaternion: Array = self._state[..., :4]
         self.body_rate: Array = self._state[..., 4:7]
         self.kept: BatchResult | None = None
@@ -462,18 +483,20 @@ class BatchResult(MotionTable):
 
     def _joint(self, name: str) -> Array:
         if name not in self._computed:
-            function, inputs = self._model.outputs[name], self._columns.inputs
-            states, count = np.moveaxis(self._state, -1, 0)[:7], self.t.shape[-1]
-            found = np.empty((1 if name == "energy" else 3, *self.t.shape))
+            function = self._model.outputs[name]
+            inputs = self._columns.inputs
+            states = np.moveaxis(self._state, -1, 0)[:7]
+            count = self.t.shape[-1]
+            components = np.empty((1 if name == "energy" else 3, *self.t.shape))
             size = max(1, _BATCH_BLOCK * count // max(self.t.size, 1))
             with np.errstate(all="ignore"):
                 for first in range(0, count, size):
                     rows = slice(first, first + size)
                     numbers = function(*states[..., rows], *inputs[:, rows])
-                    for part, number in zip(found, numbers, strict=True):
-                        part[..., rows] = number
-            found[..., self.code < 0] = np.nan
-            self._computed[name] = freeze(np.moveaxis(found, 0, -1))
+                    for component, number in zip(components, numbers, strict=True):
+                        component[..., rows] = number
+            components[..., self.code < 0] = np.nan
+            self._computed[name] = freeze(np.moveaxis(components, 0, -1))
         return self._computed[name]
 
     @cached_property
@@ -509,9 +532,14 @@ class BatchResult(MotionTable):
         geometry = np.broadcast_to(self._columns.geometry, self.code.shape)
         # only these depend on the geometry
         limited = (self.code > 0) & (self.code < NOT_FINITE_CODE)
-        # One number for both: of pairs np.unique takes a tenth of the time of a sweep.
-        both = np.where(limited, geometry, 0) * 4 * NOT_FINITE_CODE + self.code
-        _, first, index = np.unique(both, return_index=True, return_inverse=True)
+        # One number for each pair, as np.unique is slow with pairs: a tenth of the time
+        # of a sweep.
+        geometry_and_code = (
+            np.where(limited, geometry, 0) * 4 * NOT_FINITE_CODE + self.code
+        )
+        _, first, index = np.unique(
+            geometry_and_code, return_index=True, return_inverse=True
+        )
         texts = []
         for row, code in zip(first, self.code[first].tolist(), strict=True):
             own = self._columns.geometries.of_rows(geometry[row])

@@ -64,20 +64,25 @@ class BatchSession:
         step: float,
         substeps: int,
     ) -> None:
-        self._batch, self._h, self._substeps = batch, step / substeps, substeps
+        self._batch = batch
+        self._h = step / substeps
+        self._substeps = substeps
         self._y, code = batch.initial(gamma, gamma_dot)
         self._start, self._start_code = self._y.copy(), code.copy()
         number = len(code)
         self._angles, self._rates = self._spread(gamma), self._spread(gamma_dot)
-        self._given = batch.drives((0.0, 0.0, 0.0), number)
+        self._drives = batch.drives((0.0, 0.0, 0.0), number)
         self._torque_limit = batch.columns.torque_limit
         self.fault_time = np.full(number, np.nan)
-        self._error, self._done = np.zeros(number), 0
+        self._error = np.zeros(number)
+        self._steps_done = 0
         self._begun = np.zeros(number, dtype=np.int64)  # steps done at the last reset
         workers = min(len(os.sched_getaffinity(0)), max(1, number // _WORTH_A_THREAD))
         width = math.ceil(math.ceil(number / workers) / LANES) * LANES
-        parts = [slice(begin, begin + width) for begin in range(0, number, width)]
-        joints = spaced_rows(6, width * len(parts))
+        column_ranges = [
+            slice(begin, begin + width) for begin in range(0, number, width)
+        ]
+        joints = spaced_rows(6, width * len(column_ranges))
         self.state = BatchState(
             joints[:3, :number].T,
             joints[3:, :number].T,
@@ -85,8 +90,11 @@ class BatchSession:
             self._y[4:7].T,
             code,
         )
-        self._columns = self._y, self._given, code, self.fault_time, self._error
-        self._robots = [_Robots(batch, part, joints[:, part]) for part in parts]
+        self._columns = self._y, self._drives, code, self.fault_time, self._error
+        self._robots = [
+            _Robots(batch, column_range, joints[:, column_range])
+            for column_range in column_ranges
+        ]
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
         self._each(lambda robots: robots.load(*self._columns))
 
@@ -106,7 +114,7 @@ class BatchSession:
 
         """
         self._take_torques(torque)
-        first = self._done * self._substeps
+        first = self._steps_done * self._substeps
 
         def advance(robots: _Robots) -> None:
             robots.advance(first, self._substeps, self._h, *self._columns)
@@ -115,12 +123,12 @@ class BatchSession:
         ended = np.flatnonzero((self.state.code > 0) & (self._begun >= 0))
         if len(ended):
             self._locate(ended)
-        self._done += 1
+        self._steps_done += 1
         return self.state
 
     def _take_torques(self, torque: Any) -> None:
         """Write torques into the columns, clamped to the limit of the actuators."""
-        rows = self._given[:3]
+        rows = self._drives[:3]
         plain = type(torque) is np.ndarray and torque.dtype == float
         if plain and torque.shape == rows.T.shape and np.isfinite(torque).all():
             np.minimum(torque.T, self._torque_limit, out=rows)
@@ -152,14 +160,16 @@ class BatchSession:
             angles = self._angles[index] if gamma is None else gamma
             rates = self._rates[index] if gamma_dot is None else gamma_dot
             y, code = self._batch.initial(angles, rates, index)
-            self._start[:, index], self._start_code[index] = y, code
-            self._angles[index], self._rates[index] = angles, rates
+            self._start[:, index] = y
+            self._start_code[index] = code
+            self._angles[index] = angles
+            self._rates[index] = rates
         code = self._start_code[index]
         self._y[:, index] = self._start[:, index]
         self.state.code[index] = code
         self._error[index] = 0.0
         self.fault_time[index] = np.where(code < 0, 0.0, np.nan)
-        self._begun[index] = self._done
+        self._begun[index] = self._steps_done
         for robots in self._robots:
             robots.replace(index, self._start, self._start_code)
         return self.state
@@ -170,8 +180,8 @@ class BatchSession:
         index = np.arange(number) if rows is None else np.asarray(rows)
         if index.dtype == bool and index.shape == (number,):
             index = np.flatnonzero(index)
-        whole = np.issubdtype(index.dtype, np.integer) or index.size == 0
-        inside = bool(whole and ((index >= 0) & (index < number)).all())
+        are_whole = np.issubdtype(index.dtype, np.integer) or index.size == 0
+        inside = bool(are_whole and ((index >= 0) & (index < number)).all())
         refuse_unless(
             "batch",
             (
@@ -186,9 +196,13 @@ class BatchSession:
 
     def result(self) -> Any:
         """Return a copy of all states, with every quantity of a `BatchResult`."""
-        time = (self._done - np.maximum(self._begun, 0)) * self._substeps * self._h
-        batch, code, fault = self._batch, self.state.code.copy(), self.fault_time.copy()
-        torque = self._given[:3].T.copy()
+        time = (
+            (self._steps_done - np.maximum(self._begun, 0)) * self._substeps * self._h
+        )
+        batch = self._batch
+        code = self.state.code.copy()
+        fault = self.fault_time.copy()
+        torque = self._drives[:3].T.copy()
         last = np.where(np.isnan(fault), time, fault)
         return batch.result_of(
             code, fault, self._error.copy(), last, torque, self._y.copy()
@@ -196,11 +210,12 @@ class BatchSession:
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""
-        time, code = self.fault_time[rows], self.state.code[rows]
+        time = self.fault_time[rows]
+        code = self.state.code[rows]
         begins = np.ceil(time / self._h - 0.1 * EARLIEST) - 1.0
         y = np.ascontiguousarray(self._y[:, rows])
-        given = np.ascontiguousarray(self._given[:, rows])
-        locate_ends(self._batch.advance, self._h, begins, y, given, code, time)
+        drives = np.ascontiguousarray(self._drives[:, rows])
+        locate_ends(self._batch.advance, self._h, begins, y, drives, code, time)
         self.state.code[rows] = code
         self.fault_time[rows] = time - self._begun[rows] * self._substeps * self._h
         self._begun[rows] = -1
@@ -216,8 +231,8 @@ class BatchSession:
         if self._pool is None:
             work(self._robots[0])
             return
-        for done in [self._pool.submit(work, robots) for robots in self._robots]:
-            done.result()
+        for future in [self._pool.submit(work, robots) for robots in self._robots]:
+            future.result()
 
 
 class _Robots:
@@ -230,44 +245,47 @@ class _Robots:
 
     """
 
-    def __init__(self, batch: Any, part: slice, joints: Array) -> None:
-        self._part, self._joints = part, joints
+    def __init__(self, batch: Any, column_range: slice, joints: Array) -> None:
+        self._column_range = column_range
+        self._joints = joints
         self._block = Block(batch.programs, joints.shape[1])
         self._varied = self._block.given[batch.programs.varied]
         self._program = joints_of(batch)
         self._measure = [
             self._program.bind(
-                [*self._block.states(which)[:7], *self._varied], [*joints]
+                [*self._block.states(buffer)[:7], *self._varied], [*joints]
             )
-            for which in (0, 1)
+            for buffer in (0, 1)
         ]
 
     def load(self, *columns: NDArray[Any]) -> None:
         """Take over states."""
-        self._block.load(self._part, *columns)
+        self._block.load(self._column_range, *columns)
         self._measure[self._block.now]()
 
     def replace(
         self, rows: NDArray[np.intp], start: Array, code: NDArray[np.int64]
     ) -> None:
         """Begin again in those of the rows that are here, from columns of states."""
-        here = rows[(rows >= self._part.start) & (rows < self._part.stop)]
-        if len(here) == 0:
+        own_rows = rows[
+            (rows >= self._column_range.start) & (rows < self._column_range.stop)
+        ]
+        if len(own_rows) == 0:
             return
-        places = here - self._part.start
-        y = np.ascontiguousarray(start[:, here])
-        self._block.replace(places, y, code[here])
+        places = own_rows - self._column_range.start
+        y = np.ascontiguousarray(start[:, own_rows])
+        self._block.replace(places, y, code[own_rows])
         varied = np.ascontiguousarray(self._varied[:, places])
-        joints = np.empty((6, len(here)))
+        joints = np.empty((6, len(own_rows)))
         self._program((), [*y[:7], *varied], [*joints])
         self._joints[:, places] = joints
 
     def advance(self, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
         """Advance by some steps under the torques in the columns."""
-        torques = columns[1][:3, self._part]
+        torques = columns[1][:3, self._column_range]
         self._block.given[:3, : torques.shape[1]] = torques
-        self._block.run(self._part, first, count, h, *columns)
-        self._block.store(self._part, *columns)
+        self._block.run(self._column_range, first, count, h, *columns)
+        self._block.store(self._column_range, *columns)
         self._measure[self._block.now]()
 
 
@@ -276,8 +294,8 @@ def joints_of(batch: Any) -> Any:
     model = batch.model
 
     def angles(*inputs: Any) -> Sequence[Any]:
-        found = model.joints(*inputs)
-        return (*found.gamma, *found.gamma_dot)
+        joints = model.joints(*inputs)
+        return (*joints.gamma, *joints.gamma_dot)
 
     inputs = (*model.ode.state[:7], *model.names)
     return compile_columns({"angles": trace(angles, inputs)}, 0)["angles"]

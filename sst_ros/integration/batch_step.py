@@ -81,26 +81,28 @@ class ColumnStep:
     """
 
     def __init__(self, model: ParametricModel, method: Tableau) -> None:
-        self._model, self._method = model, method
+        self._model = model
+        self._method = method
         self.size = len(model.ode.state)
         self.given = len(model.ode.drive) + len(model.names)
         self.varied = slice(len(model.ode.drive), self.given)
         self.limits = len(model.limit_distances.outputs) // 2
         state = [f"y{j}" for j in range(self.size)]
         distances = [f"was{j}" for j in range(2 * self.limits)]
-        given = [f"g{j}" for j in range(self.given)]
+        drive_names = [f"g{j}" for j in range(self.given)]
         shared = ("t", "h")
-        inputs = (*shared, *state, *distances, "error", "running", *given)
+        inputs = (*shared, *state, *distances, "error", "running", *drive_names)
         ends = (*shared, "before", "rate_before", "after", "rate_after")
         self.traced = {
             "advance": trace(self._advance, inputs),
             "distances": trace(
-                self._distances, (*shared, *state[:7], *given[self.varied])
+                self._distances, (*shared, *state[:7], *drive_names[self.varied])
             ),
             "crossing": trace(share_of_crossing, ends),
         }
         functions = compile_columns(self.traced, len(shared))
-        self.advance, self.distances = functions["advance"], functions["distances"]
+        self.advance = functions["advance"]
+        self.distances = functions["distances"]
         self.crossing = functions["crossing"]
 
     def _advance(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
@@ -111,23 +113,23 @@ class ColumnStep:
         The flag is positive where a limit may have been passed or a number is not
         finite.
         """
-        rest = iter(inputs)
-        old = [next(rest) for _ in range(self.size)]
-        was = [next(rest) for _ in range(2 * self.limits)]
-        error, running, *given = rest
+        numbers = iter(inputs)
+        old = [next(numbers) for _ in range(self.size)]
+        was = [next(numbers) for _ in range(2 * self.limits)]
+        error, running, *drive_numbers = numbers
 
         def derivative(
             time: Scalar, y: Sequence[Scalar], drive: Any
         ) -> tuple[Scalar, ...]:
             return self._model.derivative(time, *y, *drive)
 
-        drives = [given] * len(self._method.b)
+        drives = [drive_numbers] * len(self._method.b)
         moved, errors = explicit_step(derivative, self._method, t, h, old, drives)
         new = normalise(moved)
-        far = self._model.distances(*new[:7], *given[self.varied])
+        far = self._model.distances(*new[:7], *drive_numbers[self.varied])
         worst = error
-        for one in (errors or ())[:4]:
-            worst = larger(worst, absolute(one))
+        for state_error in (errors or ())[:4]:
+            worst = larger(worst, absolute(state_error))
         flag = larger(may_cross(h, was, far), is_not_finite(reduce(add, new)))
         # A scenario that has ended stays where it is.
         kept = [
@@ -163,11 +165,13 @@ class Block:
     """
 
     def __init__(self, step: ColumnStep, width: int) -> None:
-        self._step, self.width = step, width
-        self._size, self._limits = step.size, step.limits
+        self._step = step
+        self.width = width
+        self._size = step.size
+        self._limits = step.limits
         rows = step.size + 2 * step.limits + 1
         self._states = spaced_rows(rows, width), spaced_rows(rows, width)
-        self._now = 0  # which of the two has the state
+        self._current = 0  # which of the two has the state
         self.running, self._flag = np.zeros(width), np.zeros(width)
         self.given = spaced_rows(step.given, width)
         first, second = self._states
@@ -184,24 +188,24 @@ class Block:
     @property
     def now(self) -> int:
         """Which of the two arrays has the states now."""
-        return self._now
+        return self._current
 
-    def states(self, which: int) -> Array:
+    def states(self, buffer: int) -> Array:
         """States in one of the two arrays, shape (size, width)."""
-        return self._states[which][: self._size]
+        return self._states[buffer][: self._size]
 
-    def load(self, part: slice, *columns: NDArray[Any]) -> None:
+    def load(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
         """Take over columns of states, drives, codes, times and errors.
 
         If there are fewer than the block has, the last one is repeated.
         """
-        y, given, code, _, error = columns
-        self._now = 0
+        y, drives, code, _, error = columns
+        self._current = 0
         first = self._states[0]
-        fill(first[: self._size], y[:, part])
-        fill(first[-1:], error[None, part])
-        fill(self.given, given[: len(self.given), part])
-        own = code[part]
+        fill(first[: self._size], y[:, columns_of_block])
+        fill(first[-1:], error[None, columns_of_block])
+        fill(self.given, drives[: len(self.given), columns_of_block])
+        own = code[columns_of_block]
         self.running[: len(own)] = own == 0
         self.running[len(own) :] = 0.0
         if self._limits:
@@ -218,25 +222,30 @@ class Block:
             code: 0 for one that can run, shape (len(places),).
 
         """
-        now = self._states[self._now]
-        now[: self._size, places] = y
-        now[-1, places] = 0.0
+        current_rows = self._states[self._current]
+        current_rows[: self._size, places] = y
+        current_rows[-1, places] = 0.0
         self.running[places] = code == 0
         varied = np.ascontiguousarray(self.given[self._step.varied][:, places])
         distances = np.empty((2 * self._limits, len(places)))
         if self._limits:
             self._step.distances((0.0, 0.0), [*y[:7], *varied], [*distances])
-        now[self._size : -1, places] = distances
+        current_rows[self._size : -1, places] = distances
 
-    def store(self, part: slice, *columns: NDArray[Any]) -> None:
+    def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
         """Put states and errors back."""
         y, _, code, _, error = columns
-        number = len(code[part])
-        y[:, part] = self.states(self._now)[:, :number]
-        error[part] = self._states[self._now][-1, :number]
+        number = len(code[columns_of_block])
+        y[:, columns_of_block] = self.states(self._current)[:, :number]
+        error[columns_of_block] = self._states[self._current][-1, :number]
 
     def run(
-        self, part: slice, first: int, count: int, h: float, *columns: NDArray[Any]
+        self,
+        columns_of_block: slice,
+        first: int,
+        count: int,
+        h: float,
+        *columns: NDArray[Any],
     ) -> None:
         """Advance the columns that were taken over by `count` steps.
 
@@ -248,10 +257,12 @@ class Block:
         for number in range(first, first + count):
             stop_if_asked()
             self.prepare_step(number)
-            self._advance[self._now](number * h, h)
-            self._now = 1 - self._now
+            self._advance[self._current](number * h, h)
+            self._current = 1 - self._current
             if np.count_nonzero(self._flag):
-                self._end_columns(number, h, code[part], time[part])
+                self._end_columns(
+                    number, h, code[columns_of_block], time[columns_of_block]
+                )
                 if not self.running.any():
                     return
 
@@ -262,15 +273,16 @@ class Block:
         self, number: int, h: float, code: NDArray[np.int64], time: Array
     ) -> None:
         """End columns that passed a limit in a step, or are not finite after it."""
-        before, after = self._states[1 - self._now], self._states[self._now]
+        before, after = self._states[1 - self._current], self._states[self._current]
         columns = np.flatnonzero(self._flag > 0.0)
-        found, share = self._first_crossings(before, after, h, columns)
+        end_codes, share = self._first_crossings(before, after, h, columns)
         with np.errstate(all="ignore"):
             total = reduce(add, after[: self._size, columns])
-            found[~np.isfinite(total)] = NOT_FINITE_CODE
-        ends = found > 0
+            end_codes[~np.isfinite(total)] = NOT_FINITE_CODE
+        ends = end_codes > 0
         ended = columns[ends]
-        code[ended], time[ended] = found[ends], (number + share[ends]) * h
+        code[ended] = end_codes[ends]
+        time[ended] = (number + share[ends]) * h
         self.running[ended] = 0.0
         after[:, ended] = before[:, ended]
 
@@ -282,8 +294,11 @@ class Block:
         Returns 1 + the index of the limit, 0 where none is passed, and the share of the
         step, 1 where none is.
         """
-        count, limits, size = len(columns), self._limits, self._size
-        found, share = np.zeros(count, dtype=np.int64), np.ones(count)
+        count = len(columns)
+        limits = self._limits
+        size = self._size
+        limit_codes = np.zeros(count, dtype=np.int64)
+        share = np.ones(count)
         padded = np.resize(columns, -(-count // LANES) * LANES)
         ends = [
             np.ascontiguousarray(states[rows, padded]).ravel()
@@ -298,10 +313,10 @@ class Block:
             self._step.crossing((0.0, h), ends, [shares.reshape(-1)])
         for limit in np.flatnonzero((shares < _NO_SHARE).any(axis=1)):
             own = shares[limit, :count]
-            earlier = (own < _NO_SHARE) & ((found == 0) | (own < share))
-            found[earlier] = limit + 1
+            earlier = (own < _NO_SHARE) & ((limit_codes == 0) | (own < share))
+            limit_codes[earlier] = limit + 1
             share[earlier] = np.maximum(own[earlier], EARLIEST)
-        return found, share
+        return limit_codes, share
 
 
 def may_cross(h: Scalar, was: Sequence[Scalar], far: Sequence[Scalar]) -> Scalar:
@@ -346,7 +361,8 @@ def share_of_crossing(
     high = select(-GRAZING - after, 1.0, lowest)
     least = value(high)
     least = select(-after, after, least)
-    end, low = high, 0.0
+    end = high
+    low = 0.0
     for _ in range(_EVENT_HALVINGS):
         middle = 0.5 * (low + end)
         outside = -value(middle)
@@ -386,10 +402,10 @@ def advance_blocks(
 
     """
     for begin in begins:
-        part = slice(begin, begin + block.width)
-        block.load(part, *columns)
-        block.run(part, first, count, h, *columns)
-        block.store(part, *columns)
+        columns_of_block = slice(begin, begin + block.width)
+        block.load(columns_of_block, *columns)
+        block.run(columns_of_block, first, count, h, *columns)
+        block.store(columns_of_block, *columns)
 
 
 REFINED_PARTS = 16
@@ -410,7 +426,7 @@ def locate_ends(
     step: float,
     steps: Array,
     y: Array,
-    given: Array,
+    drives: Array,
     code: Any,
     time: Array,
 ) -> None:
@@ -421,12 +437,13 @@ def locate_ends(
     ended = np.flatnonzero((code > 0) & (code < NOT_FINITE_CODE))
     for number in np.unique(steps[ended]):
         rows = ended[steps[ended] == number]
-        found, when = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), np.nan)
+        refined_codes = np.zeros(len(rows), dtype=np.int64)
+        refined_times = np.full(len(rows), np.nan)
         arrays = (
             np.ascontiguousarray(y[:, rows]),
-            np.ascontiguousarray(given[:, rows]),
-            found,
-            when,
+            np.ascontiguousarray(drives[:, rows]),
+            refined_codes,
+            refined_times,
         )
         first = int(number) * REFINED_PARTS
         advance(
@@ -437,5 +454,6 @@ def locate_ends(
             np.zeros(len(rows)),
             rows=rows,
         )
-        located = (found > 0) & (found < NOT_FINITE_CODE)
-        code[rows[located]], time[rows[located]] = found[located], when[located]
+        located = (refined_codes > 0) & (refined_codes < NOT_FINITE_CODE)
+        code[rows[located]] = refined_codes[located]
+        time[rows[located]] = refined_times[located]

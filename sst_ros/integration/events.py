@@ -61,10 +61,11 @@ def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> boo
     if event.error is not None:
         if before <= 0.0:
             return True
-    elif before <= GRAZING and not (
-        before > -CONTACT_BAND and event.slope(begin) > 0.0
-    ):
-        return False
+    elif before <= GRAZING:
+        # It starts on the contact: only a joint that first leaves it may meet it again.
+        is_leaving = before > -CONTACT_BAND and event.slope(begin) > 0.0
+        if not is_leaving:
+            return False
     return event.distance(end) < 0.0 or event.slope(begin) < 0.0 < event.slope(end)
 
 
@@ -76,12 +77,17 @@ def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
     slope changes sign once. A distance that starts at zero counts if it shrinks, and
     not if it grows.
     """
-    begin, end = 0.0, h
-    rising, falling = slope(0.0) > 0.0, slope(h) < 0.0
+    begin = 0.0
+    end = h
+    rising = slope(0.0) > 0.0  # at the begin
+    falling = slope(h) < 0.0  # at the end
     if distance(0.0) <= GRAZING:
         if not rising:
-            leaves = slope(0.0) < 0.0 or distance(h) < -GRAZING  # from rest, the latter
-            return 0.0 if distance(0.0) < -GRAZING or leaves else None
+            is_outside = distance(0.0) < -GRAZING
+            shrinks = slope(0.0) < 0.0
+            # A joint at rest has no slope yet: it counts where it ends outside.
+            ends_outside = distance(h) < -GRAZING
+            return 0.0 if is_outside or shrinks or ends_outside else None
         if distance(h) >= 0.0 or (distance(h) >= -GRAZING and not falling):
             return None
         # It grew first: the crossing lies behind the maximum.
@@ -127,7 +133,9 @@ def largest_passed(
     transitions: Sequence[Transition], begin: Sequence[float], end: Sequence[float]
 ) -> float:
     """Return the largest part of a width that a step passes; above 1 it leaps."""
-    return max((_passed(each, begin, end) for each in transitions), default=0.0)
+    return max(
+        (_passed(transition, begin, end) for transition in transitions), default=0.0
+    )
 
 
 def share_before_leap(
@@ -135,20 +143,25 @@ def share_before_leap(
 ) -> float:
     """Return the share of a step that leaps by which it does not."""
     return min(
-        _share(each, begin, end)
-        for each in transitions
-        if _passed(each, begin, end) > 1.0
+        _share(transition, begin, end)
+        for transition in transitions
+        if _passed(transition, begin, end) > 1.0
     )
 
 
-def _passed(each: Transition, begin: Sequence[float], end: Sequence[float]) -> float:
+def _passed(
+    transition: Transition, begin: Sequence[float], end: Sequence[float]
+) -> float:
     """Return what lies between two rates, over the width that a step may pass."""
-    low, high = sorted((begin[each.rate], end[each.rate]))
-    return (min(high, each.edge) - max(low, -each.edge)) / each.width
+    low, high = sorted((begin[transition.rate], end[transition.rate]))
+    return (min(high, transition.edge) - max(low, -transition.edge)) / transition.width
 
 
-def _share(each: Transition, begin: Sequence[float], end: Sequence[float]) -> float:
+def _share(
+    transition: Transition, begin: Sequence[float], end: Sequence[float]
+) -> float:
     """Return the share of a step after which it has passed a part of the width."""
-    before, after = begin[each.rate], end[each.rate]
-    approach = max(abs(before) - each.edge, 0.0)
-    return (approach + _ENTRY * each.width) / abs(after - before)
+    before = begin[transition.rate]
+    after = end[transition.rate]
+    approach = max(abs(before) - transition.edge, 0.0)
+    return (approach + _ENTRY * transition.width) / abs(after - before)

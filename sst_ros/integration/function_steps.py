@@ -96,7 +96,9 @@ class FunctionSteps:
             raise ValueError(
                 "a derivative of its own has no Jacobian, which the method needs"
             )
-        self.method, self._ode, self._torque = method, ode, torque
+        self.method = method
+        self._ode = ode
+        self._torque = torque
         self._derivative = derivative
         self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
         self.interpolation_cost = 3 * self.cost + 5
@@ -114,21 +116,26 @@ class FunctionSteps:
         _ = self._slope
 
     def pair(
-        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+        self,
+        t: float,
+        h: float,
+        point: Point,
+        drive: Drive,
+        second_drive: Drive | None = None,
     ) -> Outcome:
         """See `MethodSteps.pair`."""
-        drives = (drive, other or drive, other or drive)
+        drives = (drive, second_drive or drive, second_drive or drive)
 
         def step(
-            part: int, t: float, h: float, y: Sequence[float], near: Any
+            number: int, t: float, h: float, y: Sequence[float], linearised_at: Any
         ) -> NewState:
-            return self._step(t, h, y, near, drives[part])
+            return self._step(t, h, y, linearised_at, drives[number])
 
-        pair = step_pair(step, t, h, at.y, at.z, lagged_torques(self._ode))
+        pair = step_pair(step, t, h, point.y, point.z, lagged_torques(self._ode))
         joints = self._ode.dynamics.joints(*pair.y[:7])
         total = pair.total + add_up(joints)
         numbers = [*pair.y, *pair.z, *joints, pair.size, total]
-        return read_outcome(numbers, at, self._size)
+        return read_outcome(numbers, point, self._size)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -170,23 +177,25 @@ class FunctionSteps:
         t: float,
         h: float,
         y: Sequence[float],
-        near: Sequence[float],
+        linearised_at: Sequence[float],
         drive: Drive,
     ) -> NewState:
         method = self.method
         if isinstance(method, Tableau):
             drives = [drive] * len(method.a)
             return explicit_step(self.slope, method, t, h, y, drives)
-        linearisation = self._linearise(t, near, drive)
+        linearisation = self._linearise(t, linearised_at, drive)
         return rosenbrock_step(self.slope, linearisation, method, t, h, y, drive)
 
     def _linearise(self, t: float, y: Sequence[float], drive: Drive) -> Linearisation:
         """Linearise: exact by the state, by differences of the torque."""
-        size, torque = self._size, self._torque.of_drive(drive, t, y)
+        size = self._size
+        torque = self._torque.of_drive(drive, t, y)
         moment = drive.numbers[3:]
         numbers = self._ode.linearised_by_torque(t, *y, *torque, *moment)
         rows = np.array(numbers).reshape(size + 5, size)
-        slope, by_time = rows[0], rows[1]
+        slope = rows[0]
+        by_time = rows[1]
         by_state, by_torque = rows[2 : size + 2], rows[size + 2 :]
         rate = self._torque.rate(drive, t, y, torque)
         feedback = self._torque.by_state(drive, t, y, torque)
@@ -209,13 +218,18 @@ class TimeSteps(FunctionSteps):
         _ = self._functions
 
     def pair(
-        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+        self,
+        t: float,
+        h: float,
+        point: Point,
+        drive: Drive,
+        second_drive: Drive | None = None,
     ) -> Outcome:
         """See `MethodSteps.pair`.
 
         `stages` are the torques in the stages of its steps.
         """
-        if other is not None:
+        if second_drive is not None:
             raise ValueError("a function of the time is the same for both solutions")
         half = 0.5 * h
         times = [
@@ -225,8 +239,8 @@ class TimeSteps(FunctionSteps):
         ]
         torques = self._torques_at(times, drive)
         stages = self._join(torques, drive)
-        numbers = self._functions["pair"](t, h, *at.y, *at.z, *stages)
-        return read_outcome(numbers, at, self._size, torques)
+        numbers = self._functions["pair"](t, h, *point.y, *point.z, *stages)
+        return read_outcome(numbers, point, self._size, torques)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -269,8 +283,8 @@ class TimeSteps(FunctionSteps):
         different = list(dict.fromkeys(times))
         absolute = [drive.start + time for time in different]
         torques = self._torque.at_times(drive.function, absolute)
-        known = dict(zip(different, torques, strict=True))
-        return [known[time] for time in times]
+        torque_by_time = dict(zip(different, torques, strict=True))
+        return [torque_by_time[time] for time in times]
 
     @staticmethod
     def _join(torques: Sequence[Any], drive: Drive) -> list[float]:
@@ -287,10 +301,10 @@ class TimeSteps(FunctionSteps):
     ) -> Array:
         """Return torques in the stages of steps to times inside, shape (n, s, 3)."""
         fit = fit_of(self.method)
-        known = np.array([step.stages for step in steps])
-        coefficients = fit.solution @ known[:, fit.fitted]
-        off = np.abs(fit.values @ coefficients - known[:, fit.checked])
-        largest = np.abs(known).max(axis=(1, 2))
+        stage_torques = np.array([step.stages for step in steps])
+        coefficients = fit.solution @ stage_torques[:, fit.fitted]
+        off = np.abs(fit.values @ coefficients - stage_torques[:, fit.checked])
+        largest = np.abs(stage_torques).max(axis=(1, 2))
         is_smooth = off.max(axis=(1, 2)) <= _SAME_TORQUE * largest
         lengths = np.array([step.h for step in steps]).repeat(counts)
         shares = np.multiply.outer(x / lengths, self.method.c)
@@ -319,7 +333,9 @@ def compile_rows_by_stage(ode: ODE, method: Tableau) -> RowsFunction:
 
 
 def _trace_by_stage(ode: ODE, method: Tableau) -> dict[str, Program]:
-    size, drive, lagged = len(ode.state), len(ode.drive), lagged_torques(ode)
+    size = len(ode.state)
+    drive = len(ode.drive)
+    lagged = lagged_torques(ode)
     return {
         "slope": ode.program,
         "joints": ode.dynamics.joints_program,
@@ -385,27 +401,35 @@ class FeedbackSteps(FunctionSteps):
         _ = self._functions
 
     def pair(
-        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+        self,
+        t: float,
+        h: float,
+        point: Point,
+        drive: Drive,
+        second_drive: Drive | None = None,
     ) -> Outcome:
         """See `MethodSteps.pair`.
 
         `stages` are the slopes in the stages of the first.
         """
-        second = drive if other is None else other
-        joints, half, z = self._functions["joints"], 0.5 * h, at.z
-        slopes, y_end = self._go(t, h, at.y, at.joints, drive)
-        _, middle = self._go(t, half, z, joints(*z[:7]), second)
+        if second_drive is None:
+            second_drive = drive
+        joints = self._functions["joints"]
+        half = 0.5 * h
+        z = point.z
+        slopes, y_end = self._go(t, h, point.y, point.joints, drive)
+        _, middle = self._go(t, half, z, joints(*z[:7]), second_drive)
         middle = middle[: self._size]
-        _, z_end = self._go(t + half, half, middle, joints(*middle[:7]), second)
-        numbers = self._functions["end"](h, *at.y, *z, *y_end, *z_end)
-        return read_outcome(numbers, at, self._size, slopes)
+        _, z_end = self._go(t + half, half, middle, joints(*middle[:7]), second_drive)
+        numbers = self._functions["end"](h, *point.y, *z, *y_end, *z_end)
+        return read_outcome(numbers, point, self._size, slopes)
 
     def _step(
         self,
         t: float,
         h: float,
         y: Sequence[float],
-        near: Sequence[float],
+        linearised_at: Sequence[float],
         drive: Drive,
     ) -> NewState:
         joints = self._functions["joints"](*y[:7])
@@ -424,8 +448,12 @@ class FeedbackSteps(FunctionSteps):
 
         `joints` are those of y.
         """
-        functions, size, moment = self._functions, self._size, drive.numbers[3:]
-        evaluate, function, start = self._torque.of_state, drive.function, drive.start
+        functions = self._functions
+        size = self._size
+        moment = drive.numbers[3:]
+        evaluate = self._torque.of_state
+        function = drive.function
+        start = drive.start
         assert function is not None
         slopes: list[float] = []
         point = y
@@ -447,7 +475,9 @@ class FeedbackSteps(FunctionSteps):
         if dense is None:
             return super().interpolate(step)
         a, weights_of_terms = _arrays_of_dense(dense)
-        size, h, begin = self._size, step.h, np.array(step.begin.y)
+        size = self._size
+        h = step.h
+        begin = np.array(step.begin.y)
         slopes = np.array(step.stages).reshape(-1, size)
         end = np.array(step.end.y)
         slopes = np.vstack([slopes, self.slope(step.t + h, step.end.y, step.drive)])
@@ -486,7 +516,9 @@ _WORST_OF_DENSE = 0.83
 @lru_cache(maxsize=64)
 def compile_stages(ode: ODE, method: Tableau) -> dict[str, Function]:
     """Compile the programs of `trace_stages`, and `joints`."""
-    size, drive, lagged = len(ode.state), len(ode.drive), lagged_torques(ode)
+    size = len(ode.state)
+    drive = len(ode.drive)
+    lagged = lagged_torques(ode)
     stages = trace_stages(method, size, drive, lagged)
     programs = {
         "slope": ode.program,
@@ -514,10 +546,11 @@ def trace_stages(
     stages = len(method.a)
 
     def take_stage(number: int, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, rest = inputs[:size], inputs[size:]
-        slopes = [rest[size * k : size * (k + 1)] for k in range(number)]
-        point = rest[size * number : size * (number + 1)]
-        slopes.append(slope(t, *point, *rest[size * (number + 1) :]))
+        y = inputs[:size]
+        stage_inputs = inputs[size:]
+        slopes = [stage_inputs[size * k : size * (k + 1)] for k in range(number)]
+        point = stage_inputs[size * number : size * (number + 1)]
+        slopes.append(slope(t, *point, *stage_inputs[size * (number + 1) :]))
         if number == stages - 1:
             new = end_step(method, h, y, slopes)
             return (*slopes[-1], *new.state, *(new.error or ()))
@@ -525,11 +558,13 @@ def trace_stages(
         return (*slopes[-1], *following, *joints(*following[:7]))
 
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, z, rest = inputs[:size], inputs[size : 2 * size], inputs[2 * size :]
-        half = len(rest) // 2
+        y = inputs[:size]
+        z = inputs[size : 2 * size]
+        step_ends = inputs[2 * size :]
+        half = len(step_ends) // 2
         first, second = (
             NewState([*end[:size]], [*end[size:]] or None)
-            for end in (rest[:half], rest[half:])
+            for end in (step_ends[:half], step_ends[half:])
         )
         pair = compare(h, y, z, first, second, lagged)
         angles = joints(*pair.y[:7])
@@ -541,10 +576,10 @@ def trace_stages(
         count = 2 + (2 + number) * size + drive
         names = [f"i{k}" for k in range(count)]
 
-        def part(*inputs: Any, number: int = number) -> tuple[Any, ...]:
+        def take_numbered(*inputs: Any, number: int = number) -> tuple[Any, ...]:
             return take_stage(number, *inputs)
 
-        programs[f"stage{number}"] = trace(part, names)
+        programs[f"stage{number}"] = trace(take_numbered, names)
     count = 1 + (2 + 2 * (2 if has_error(method) else 1)) * size
     programs["end"] = trace(end_pair, [f"i{k}" for k in range(count)])
     return programs

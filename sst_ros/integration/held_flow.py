@@ -35,8 +35,12 @@ _AT_STOPS = 0.1
 
 A step across a jump of derivatives loses its order.
 """
-_SAFETY, _LARGEST_GROWTH, _LARGEST_SHRINKAGE = 0.9, 5.0, 0.2
-"""Factors by which a step changes."""
+_SAFETY = 0.9
+"""Share of the step that the error allows."""
+_LARGEST_GROWTH = 5.0
+"""Factor by which a step grows at most."""
+_LARGEST_SHRINKAGE = 0.2
+"""Factor by which it shrinks at most."""
 _SHORTEST = 1e-16
 """Share of the period below which no step resolves the motion."""
 
@@ -81,7 +85,8 @@ def follow_held_torque(
         None where the motion does not last, or takes more evaluations.
 
     """
-    size, step = len(y), _compile_step(ode)
+    size = len(y)
+    step = _compile_step(ode)
     columns = size + LEGS  # of S: by the state at the begin, then by the torques
     rows = _rows_of_motion(ode, columns, torque)
     moving = rows[:, 1 : 1 + 2 * size]  # the motion, and a column of S
@@ -89,8 +94,11 @@ def follow_held_torque(
     moving[:size, size:] = np.eye(size)
     rows[size:, -LEGS:] = np.eye(LEGS)
     tolerance = _TOLERANCE * (_AT_STOPS if elastic else 1.0)
-    times, states = [0.0], [moving[0, :size].copy()]
-    t, h, evaluations = 0.0, length, 0
+    times = [0.0]
+    states = [moving[0, :size].copy()]
+    t = 0.0
+    h = length
+    evaluations = 0
     while t < length:
         h = min(h, length - t)
         evaluations += len(DOP853.c)
@@ -154,19 +162,22 @@ def _compile_step(ode: ODE) -> RowsFunction:
     and column, their largest error relative to numbers above 1, and a total that is
     finite where all numbers are.
     """
-    size, drive_size = len(ode.state), len(ode.drive)
+    size = len(ode.state)
+    drive_size = len(ode.drive)
     tangent = Routine("tangent", 1 + 2 * size + drive_size + LEGS, 2 * size)
 
     def differentiate(
-        time: Any, point: Sequence[Any], held: Sequence[Any]
+        time: Any, point: Sequence[Any], drive_and_rates: Sequence[Any]
     ) -> Sequence[Any]:
         state, column = point[:size], point[size:]
-        drive, torque_rates = held[:drive_size], held[drive_size:]
+        drive = drive_and_rates[:drive_size]
+        torque_rates = drive_and_rates[drive_size:]
         return tangent(time, *state, *drive, *column, *torque_rates)
 
     def take_step(h: Any, *numbers: Any) -> list[Any]:
-        before, held = numbers[: 2 * size], numbers[2 * size :]
-        each = [held] * len(DOP853.a)
+        before = numbers[: 2 * size]
+        drive_and_rates = numbers[2 * size :]
+        each = [drive_and_rates] * len(DOP853.a)
         # held torques: the motion does not depend on the time
         after, errors = explicit_step(differentiate, DOP853, 0.0, h, before, each)
         assert errors is not None

@@ -59,7 +59,8 @@ class MethodSteps:
     """
 
     def __init__(self, ode: ODE, method: Method) -> None:
-        self.method, self._ode = method, ode
+        self.method = method
+        self._ode = ode
         implicit = isinstance(method, Rosenbrock)
         self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
         self._size = len(ode.state)
@@ -67,7 +68,8 @@ class MethodSteps:
     @cached_property
     def _programs(self) -> dict[str, Program]:
         """`pair`, `single` and `slope` of this scene, and what they call."""
-        ode, method = self._ode, self.method
+        ode = self._ode
+        method = self.method
         programs = {
             "slope": ode.program,
             "joints": ode.dynamics.joints_program,
@@ -90,19 +92,25 @@ class MethodSteps:
         _ = self._functions
 
     def pair(
-        self, t: float, h: float, at: Point, drive: Drive, other: Drive | None = None
+        self,
+        t: float,
+        h: float,
+        point: Point,
+        drive: Drive,
+        second_drive: Drive | None = None,
     ) -> Outcome:
         """Advance both solutions of a point by h: by one step, and by two of h / 2.
 
-        The second one has the drive `other`, by default that of the first. Returns
-        where they end, and the local error estimate in units of the tolerance; infinite
-        where a number of the step is not finite.
+        The second one has the drive `second_drive`, by default that of the first.
+        Returns where they end, and the local error estimate in units of the tolerance;
+        infinite where a number of the step is not finite.
         """
-        second = drive if other is None else other
+        if second_drive is None:
+            second_drive = drive
         numbers = self._functions["pair"](
-            t, h, *at.y, *at.z, *drive.numbers, *second.numbers
+            t, h, *point.y, *point.z, *drive.numbers, *second_drive.numbers
         )
-        return read_outcome(numbers, at, self._size)
+        return read_outcome(numbers, point, self._size)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -117,7 +125,9 @@ class MethodSteps:
         self, t: float, h: float, count: int, y: Sequence[float], drive: Drive
     ) -> list[float]:
         """Advance a state by `count` steps of h; their errors are not looked at."""
-        single, numbers, state = self._functions["single"], drive.numbers, [*y]
+        single = self._functions["single"]
+        numbers = drive.numbers
+        state = [*y]
         for k in range(count):
             state = single(t + k * h, h, *state, *numbers)
         return state
@@ -186,13 +196,13 @@ def trace_steps(
     joints = Routine("joints", 7, JOINT_NUMBERS)
     stages = len(method.a) if by_stage else 1
     state = [f"y{i}" for i in range(size)]
-    near = [f"near{i}" for i in range(size)] if implicit else []
+    point_names = [f"near{i}" for i in range(size)] if implicit else []
     second = [f"z{i}" for i in range(size)]
     drives = [f"d{i}" for i in range(stages * drive)]
-    others = [f"e{i}" for i in range((2 if by_stage else 1) * stages * drive)]
+    second_names = [f"e{i}" for i in range((2 if by_stage else 1) * stages * drive)]
     step = Routine(
         "step",
-        2 + size + len(near) + len(drives),
+        2 + size + len(point_names) + len(drives),
         size * (2 if has_error(method) else 1),
     )
 
@@ -200,17 +210,15 @@ def trace_steps(
         return slope(t, *y, *numbers)
 
     def take_step(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, point, numbers = (
-            inputs[:size],
-            inputs[size : size + len(near)],
-            inputs[size + len(near) :],
-        )
+        y = inputs[:size]
+        point = inputs[size : size + len(point_names)]
+        numbers = inputs[size + len(point_names) :]
         if isinstance(method, Rosenbrock):
             linearisation = _linearise(t, point, numbers)
             new = rosenbrock_step(derivative, linearisation, method, t, h, y, numbers)
         else:
-            held = [numbers[drive * k : drive * (k + 1)] for k in range(stages)]
-            each = held if by_stage else held * len(method.a)
+            stage_drives = [numbers[drive * k : drive * (k + 1)] for k in range(stages)]
+            each = stage_drives if by_stage else stage_drives * len(method.a)
             new = explicit_step(derivative, method, t, h, y, each)
         return (*new.state, *(new.error or ()))
 
@@ -222,15 +230,23 @@ def trace_steps(
         return Linearisation(rows[0], rows[1], rows[2:])
 
     def take_pair(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, z = inputs[:size], inputs[size : 2 * size]
-        given = inputs[2 * size :]
-        first, rest = given[: len(drives)], given[len(drives) :]
-        by_part = (first, rest[: len(drives)], rest[-len(drives) :])
+        y = inputs[:size]
+        z = inputs[size : 2 * size]
+        drive_inputs = inputs[2 * size :]
+        second_drives = drive_inputs[len(drives) :]
+        # of the step of y, and of both steps of z, which may have the same
+        drives_of_steps = (
+            drive_inputs[: len(drives)],
+            second_drives[: len(drives)],
+            second_drives[-len(drives) :],
+        )
 
         def call(
-            part: int, t: Any, h: Any, y: Sequence[Any], near: Sequence[Any]
+            number: int, t: Any, h: Any, y: Sequence[Any], linearised_at: Sequence[Any]
         ) -> NewState:
-            results = step(t, h, *y, *(near if implicit else ()), *by_part[part])
+            results = step(
+                t, h, *y, *(linearised_at if implicit else ()), *drives_of_steps[number]
+            )
             return NewState([*results[:size]], [*results[size:]] or None)
 
         pair = step_pair(call, t, h, y, z, lagged)
@@ -239,13 +255,14 @@ def trace_steps(
         return (*pair.y, *pair.z, *angles, pair.size, total)
 
     def take_single(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y, numbers = inputs[:size], inputs[size:]
+        y = inputs[:size]
+        numbers = inputs[size:]
         results = step(t, h, *y, *(y if implicit else ()), *numbers)
         return tuple(normalise(results[:size]))
 
     return {
-        "step": trace(take_step, ("t", "h", *state, *near, *drives)),
-        "pair": trace(take_pair, ("t", "h", *state, *second, *drives, *others)),
+        "step": trace(take_step, ("t", "h", *state, *point_names, *drives)),
+        "pair": trace(take_pair, ("t", "h", *state, *second, *drives, *second_names)),
         "single": trace(take_single, ("t", "h", *state, *drives)),
     }
 
@@ -261,7 +278,7 @@ def lagged_torques(ode: ODE) -> int:
 
 
 def read_outcome(
-    numbers: Sequence[float], at: Point, size: int, stages: Sequence[Any] = ()
+    numbers: Sequence[float], point: Point, size: int, stages: Sequence[Any] = ()
 ) -> Outcome:
     """Read the outputs of `pair`."""
     *_, error, total = numbers
@@ -270,10 +287,10 @@ def read_outcome(
         [*numbers[:size]],
         [*numbers[size : 2 * size]],
         tuple(numbers[2 * size : 2 * size + JOINT_NUMBERS]),
-        at.method,
-        at.h,
-        at.attempts,
-        at.steps + 1,
-        at.changes,
+        point.method,
+        point.h,
+        point.attempts,
+        point.steps + 1,
+        point.changes,
     )
     return Outcome(after, error if finite else math.inf, stages)

@@ -73,8 +73,12 @@ WHOLE_MOTION_BUDGET = 10_000_000
 They take minutes in plain Python.
 """
 
-_LARGEST_GROWTH, _LARGEST_SHRINKAGE, _SAFETY = 5.0, 0.2, 0.9
-"""Factors by which a step changes at most; share of the step that the error allows."""
+_LARGEST_GROWTH = 5.0
+"""Factor by which a step grows at most: one small estimate may be chance."""
+_LARGEST_SHRINKAGE = 0.2
+"""Factor by which it shrinks at most: an error far too large says little."""
+_SAFETY = 0.9
+"""Share of the step that the error allows, so that few steps are rejected."""
 _LAST_SLIVER = 1e-3
 """A step also takes the rest of a period that is shorter than this share of it."""
 _SHORTEST_STEP = 1e-15
@@ -127,7 +131,8 @@ class LimitReached(Exception):
     """A limit of the scene ends the motion at a time [s]."""
 
     def __init__(self, limit: Limit, time: float) -> None:
-        self.limit, self.time = limit, time
+        self.limit = limit
+        self.time = time
         super().__init__(limit.reason)
 
 
@@ -150,8 +155,10 @@ class EvaluationBudget:
     """
 
     def __init__(self, per_period: int, *, whole_run: bool = False) -> None:
-        self.per_period, self._whole_run = per_period, whole_run
-        self.spent, self._end = 0, per_period
+        self.per_period = per_period
+        self._whole_run = whole_run
+        self.spent = 0
+        self._end = per_period
 
     def begin(self) -> None:
         """Begin a period."""
@@ -220,7 +227,8 @@ class Stepper:
         traced = derivative is None
         self.torque = AppliedTorque(self.dynamics, scene.torque_limit)
         self._derivative = derivative
-        self._tolerance, self._max_step = tolerance, max_step
+        self._tolerance = tolerance
+        self._max_step = max_step
         self._methods = methods_of(method)
         # A derivative of its own has no Jacobian to choose a method by.
         self._chooses = len(self._methods) > 1 and traced
@@ -240,21 +248,21 @@ class Stepper:
         """Have the code compiled that periods under constant torques may need."""
         import scipy.optimize  # noqa: F401  # takes 0.4 s, too long for a step in real time
 
-        held = self._hold((0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[3:]))
+        drive = self._hold((0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[3:]))
         for method in self._methods if self._chooses else self._methods[:1]:
-            self._steps_of(held, method).load()
+            self._steps_of(drive, method).load()
         if self._chooses:
             _ = self.ode.linearised
 
-    def acting(self, torque: Torque, time: float, at: Point) -> Vector3:
+    def acting(self, torque: Torque, time: float, point: Point) -> Vector3:
         """Torques that the actuators give at a time [s] and a point [N m]."""
         if len(self.dynamics.state) > 7:  # they lag
-            return at.y[7], at.y[8], at.y[9]
-        return self.torque.at(torque, time, at.y)
+            return point.y[7], point.y[8], point.y[9]
+        return self.torque.at(torque, time, point.y)
 
     def advance(
         self,
-        at: Point,
+        point: Point,
         start: float,
         h: float,
         torque: Torque,
@@ -266,7 +274,7 @@ class Stepper:
         """Advance through a period, by steps up to the first event in each.
 
         Args:
-            at: where it begins.
+            point: where it begins.
             start: when it begins [s].
             h: its length [s].
             torque: one of `AppliedTorque.acting`.
@@ -284,22 +292,23 @@ class Stepper:
         drive = self._hold(torque, start, moment)
         second = None if other is None else Drive((*other, *moment))
         self.budget.begin()
-        x, stops = 0.0, list[float]()
-        steps = self._steps_of(drive, at.method)
+        x = 0.0
+        stops = list[float]()
+        steps = self._steps_of(drive, point.method)
         while x < h:
-            step = self._take_step(x, h, at, drive, second, stops, steps)
+            step = self._take_step(x, h, point, drive, second, stops, steps)
             steps = step.steps
             event = None
             if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
                 try:
                     step, event = self._until_event(step)
                 except _NoState:  # the step has leapt over a singularity
-                    at = step.begin._replace(h=0.5 * step.h)
+                    point = step.begin._replace(h=0.5 * step.h)
                     stops.clear()
                     continue
             if visit is not None:
                 visit(step)
-            at = step.end
+            point = step.end
             if event is not None:
                 x = step.t + step.h
                 stops.clear()
@@ -311,7 +320,7 @@ class Stepper:
                 x = stops.pop(0)
             else:
                 x += step.h
-        return at
+        return point
 
     def _hold(self, torque: Torque, start: float, moment: Moment) -> Drive:
         """Return what acts in a period that begins at `start` [s]."""
@@ -347,7 +356,8 @@ class Stepper:
 
     def _make_steps(self, drive: Drive, method: Method) -> Steps:
         """Make the steps of a method under a drive."""
-        sine, function = drive.sine, drive.function
+        sine = drive.sine
+        function = drive.function
         if sine is not None:
             limit = self.torque.limit_of(sine)
             ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
@@ -364,9 +374,9 @@ class Stepper:
         self,
         t: float,
         end: float,
-        at: Point,
+        point: Point,
         drive: Drive,
-        other: Drive | None,
+        second_drive: Drive | None,
         stops: list[float],
         steps: Steps,
     ) -> Step:
@@ -377,64 +387,72 @@ class Stepper:
         """
         rejected = leaps = looks = 0
         while True:
-            if steps.method is not at.method:
-                steps = self._steps_of(drive, at.method)
+            if steps.method is not point.method:
+                steps = self._steps_of(drive, point.method)
             left = end - t
-            h = min(at.h, self._max_step, left)
+            h = min(point.h, self._max_step, left)
             if left - h < _LAST_SLIVER * h:
                 h = left
             if stops:  # a step ends before a jump, the next one steps over it
                 h = min(h, stops[0] - t)
-            self.budget.charge((3 if other is None else 6) * steps.cost)
-            after, size, stages = steps.pair(t, h, at, drive, other)
+            self.budget.charge((3 if second_drive is None else 6) * steps.cost)
+            after, size, stages = steps.pair(t, h, point, drive, second_drive)
             error = size / self._tolerance
             if size <= self._tolerance:
-                if looks < _MOST_LOOKS and self._meets_pulse(t, h, at, drive, stops):
+                if looks < _MOST_LOOKS and self._meets_pulse(t, h, point, drive, stops):
                     looks += 1
-                    at = at._replace(h=h if stops else 0.5 * h)
+                    point = point._replace(h=h if stops else 0.5 * h)
                     continue
-                ends = at.joints, after.joints
+                ends = point.joints, after.joints
                 passed = largest_passed(self._transitions, *ends)
                 if passed > 1.0:
                     share = share_before_leap(self._transitions, *ends)
                     if leaps:  # the rates are far from linear: a joint that sticks
                         share = min(share, 0.5)
                     if h * share > _SHORTEST_IN_TRANSITION * max(abs(t), end - t):
-                        at = at._replace(h=h * share)
+                        point = point._replace(h=h * share)
                         leaps += 1
                         continue
                 stopped = bool(stops) and h == stops[0] - t
-                longest = _next_length(at, h, error, cut=stopped or h == left)
+                longest = _next_length(point, h, error, cut=stopped or h == left)
                 if passed > 0.0:  # the next step is not to be refused for a leap
                     longest = min(longest, _SAFETY * h / passed)
                 looks = self._chooses and (
-                    h < left or isinstance(at.method, Rosenbrock)
+                    h < left or isinstance(point.method, Rosenbrock)
                 )
-                attempts = at.attempts + 1 if looks else at.attempts
+                attempts = point.attempts + 1 if looks else point.attempts
                 end_point = Point(
-                    after.y, after.z, after.joints, at.method, longest, attempts,
-                    after.steps, at.changes,
+                    after.y, after.z, after.joints, point.method, longest, attempts,
+                    after.steps, point.changes,
                 )  # fmt: skip
                 if looks:
                     end_point = self._choose_method(
                         steps, t + h, h, end_point, drive, 0
                     )
                 last = h == left
-                return Step(t, h, at, end_point, drive, other, steps, last, stages)
-            stops[:] = self._jump_in(t, h, at.y, drive)
+                return Step(
+                    t, h, point, end_point, drive, second_drive, steps, last, stages
+                )
+            stops[:] = self._jump_in(t, h, point.y, drive)
             if stops:
-                at = at._replace(h=h)
+                point = point._replace(h=h)
                 continue
-            at = at._replace(h=h * min(_step_factor(error, at.method), 1.0))
-            if at.h < _SHORTEST_STEP * max(abs(t), end - t) or at.h < 1e-200:
-                raise CannotStep(f"steps of {at.h:.1e} s do not resolve it")
+            point = point._replace(h=h * min(_step_factor(error, point.method), 1.0))
+            if point.h < _SHORTEST_STEP * max(abs(t), end - t) or point.h < 1e-200:
+                raise CannotStep(f"steps of {point.h:.1e} s do not resolve it")
             rejected += 1
             if self._chooses:
-                at = at._replace(attempts=at.attempts + 1)
-                at = self._choose_method(steps, t, h, at, drive, rejected)
+                point = point._replace(attempts=point.attempts + 1)
+                point = self._choose_method(steps, t, h, point, drive, rejected)
 
     def _choose_method(
-        self, steps: Steps, t: float, h: float, at: Point, drive: Drive, rejected: int
+        self,
+        steps: Steps,
+        t: float,
+        h: float,
+        point: Point,
+        drive: Drive,
+        rejected: int,
     ) -> Point:
         """Change the method if another takes longer steps.
 
@@ -442,34 +460,34 @@ class Stepper:
         that were rejected.
         """
         early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(
-            at.method, Rosenbrock
+            point.method, Rosenbrock
         )
-        if at.attempts < _CHOOSE_EVERY and not early:
-            return at
+        if point.attempts < _CHOOSE_EVERY and not early:
+            return point
         if not early:
-            at = at._replace(attempts=0)
+            point = point._replace(attempts=0)
         self.budget.charge(JACOBIAN_COST)
         try:
-            jacobian = steps.jacobian(t, at.y, drive)
+            jacobian = steps.jacobian(t, point.y, drive)
         except ArithmeticError:
-            return at  # no finite Jacobian here; the step size has to do
+            return point  # no finite Jacobian here; the step size has to do
         # Nothing depends on the work, the last number, which adds an eigenvalue of
         # zero.
-        only_stiff = early or at.method is DOP853 or self._tolerance >= ACCURATE
+        only_stiff = early or point.method is DOP853 or self._tolerance >= ACCURATE
         if (
             only_stiff
-            and not isinstance(at.method, Rosenbrock)
+            and not isinstance(point.method, Rosenbrock)
             and h * bound_of_eigenvalues(jacobian[:-1, :-1]) <= _STIFF
         ):
-            return at
+            return point
         eigenvalues = np.asarray(np.linalg.eigvals(jacobian), dtype=complex)
         method, reason = better_method(
-            at.method, self._tolerance, h * eigenvalues, only_stiff=early
+            point.method, self._tolerance, h * eigenvalues, only_stiff=early
         )
-        if method is at.method:
-            return at
+        if method is point.method:
+            return point
         change = MethodChange(drive.start + t, method.name, reason)
-        return at._replace(method=method, changes=(*at.changes, change))
+        return point._replace(method=method, changes=(*point.changes, change))
 
     def _jump_in(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -498,7 +516,7 @@ class Stepper:
         return [stop for stop in (jump[0] - margin, jump[1] + margin) if stop > t]
 
     def _meets_pulse(
-        self, t: float, h: float, at: Point, drive: Drive, stops: list[float]
+        self, t: float, h: float, point: Point, drive: Drive, stops: list[float]
     ) -> bool:
         """Return whether a step passes over a pulse of a function of the time.
 
@@ -510,7 +528,7 @@ class Stepper:
         pulse = self.torque.find_pulse(drive, t, h)
         if pulse is None:
             return False
-        edges = self._stops_at_jump(pulse.begin, pulse.end, at.y, drive, t, h)
+        edges = self._stops_at_jump(pulse.begin, pulse.end, point.y, drive, t, h)
         if edges and edges != stops:
             stops[:] = edges
             return True
@@ -522,8 +540,10 @@ class Stepper:
         Raises _NoState where a state inside is not finite.
         """
         begin, end = step.begin.joints, step.end.joints
-        near = [event for event in self._events if may_occur(event, begin, end)]
-        if not near:
+        possible_events = [
+            event for event in self._events if may_occur(event, begin, end)
+        ]
+        if not possible_events:
             return step, None
 
         @cache
@@ -539,26 +559,26 @@ class Stepper:
                 raise _NoState
             return inside
 
-        first = first_event(near, joints, step.h)
+        first = first_event(possible_events, joints, step.h)
         if first is None:
             return step, None
         x, event = first
         if event.error is None:
             beyond = x + _BEHIND_A_KINK / max(abs(event.slope(joints(x))), 1e-200)
             x = min(beyond, x + _LARGEST_SHARE_BEHIND * step.h, step.h)
-        return self._part(step, x), event
+        return self._shorten(step, x), event
 
-    def _part(self, step: Step, x: float) -> Step:
+    def _shorten(self, step: Step, x: float) -> Step:
         """Return the first x [s] of an accepted step, by a shorter one."""
         if x == 0.0:
             return step._replace(h=0.0, end=step.begin, last=False)
         if x == step.h:
             return step
         self.budget.charge(step.cost)
-        part = step.steps.pair(step.t, x, step.begin, step.drive, step.other)
-        after = part.point
+        outcome = step.steps.pair(step.t, x, step.begin, step.drive, step.other)
+        after = outcome.point
         end = step.end._replace(y=after.y, z=after.z, joints=after.joints)
-        return step._replace(h=x, end=end, last=False, stages=part.stages)
+        return step._replace(h=x, end=end, last=False, stages=outcome.stages)
 
 
 def methods_of(name: str) -> tuple[Method, ...]:
@@ -578,7 +598,8 @@ def better_method(
     It is the one in use where none would. `steps` is the length of a step times the
     eigenvalues of the Jacobian; `only_stiff` looks for stiffness alone.
     """
-    radius, decay = np.abs(steps).max(), -steps.real.min()
+    radius = np.abs(steps).max()
+    decay = -steps.real.min()
     implicit = isinstance(method, Rosenbrock)
     if not implicit and decay > _STIFF and decay > 0.5 * radius:
         return RODAS5P, f"stiff: step times fastest decay is {decay:.2g}"
@@ -597,14 +618,14 @@ def bound_of_eigenvalues(matrix: Array) -> float:
     return float(min(sizes.sum(axis=0).max(), sizes.sum(axis=1).max()))
 
 
-def _next_length(at: Point, h: float, error: float, *, cut: bool) -> float:
+def _next_length(point: Point, h: float, error: float, *, cut: bool) -> float:
     """Return the longest step after an accepted one of h, by its local error.
 
     The error is relative to the tolerance. A step that was cut does not say that the
     next must be shorter than the longest of before.
     """
-    length = h * _step_factor(error, at.method)
-    return max(at.h, length) if cut else length
+    length = h * _step_factor(error, point.method)
+    return max(point.h, length) if cut else length
 
 
 def _step_factor(error: float, method: Method) -> float:

@@ -107,8 +107,8 @@ def _estimate_error(
         if method.damping:
             # Hairer's estimate for DOP853, each number of the state for itself.
             coarse = _weigh(method.damping, column)
-            both = fine * fine + 0.01 * (coarse * coarse) + _NO_DIVISION_BY_ZERO
-            errors.append(h * fine * absolute(fine) / sqrt(both))
+            square = fine * fine + 0.01 * (coarse * coarse) + _NO_DIVISION_BY_ZERO
+            errors.append(h * fine * absolute(fine) / sqrt(square))
         else:
             errors.append(h * fine)
     return errors
@@ -258,12 +258,17 @@ def size_of_error(
 
 
 def _compare(
-    error: Numbers, old: Numbers, new: Numbers, part: slice, least: float
+    error: Numbers, old: Numbers, new: Numbers, indices: slice, least: float
 ) -> tuple[Number, Number]:
-    """Return a part's largest absolute number in two states, and its largest error."""
+    """Return the largest absolute number at some indices, and the largest error.
+
+    The number is of two states, and at least `least`.
+    """
     length: Number = least
     worst: Number = 0.0
-    for before, after, change in zip(old[part], new[part], error[part], strict=True):
+    for before, after, change in zip(
+        old[indices], new[indices], error[indices], strict=True
+    ):
         length = larger(larger(length, absolute(before)), absolute(after))
         worst = larger(worst, absolute(change))
     return length, worst
@@ -292,10 +297,10 @@ def step_pair(
     """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
 
     Args:
-        step: (part, time, length, state, near) -> the new state: part 0 is the step of
-            y, and 1 and 2 are those of z. A Jacobian is that of the state `near`, which
-            is y for the first step of z: beside a kink of a force both solutions then
-            have the same.
+        step: (number, time, length, state, point) -> the new state: number 0 is the
+            step of y, and 1 and 2 are those of z. A Jacobian is that of the state
+            `point`, which is y for the first step of z: beside a kink of a force both
+            solutions then have the same.
         t: time at which the step begins [s].
         h: its length [s].
         y: first solution.

@@ -44,11 +44,15 @@ def compile_functions(
     if llvmlite_version() is not None:
         module = write_module(programs)
         return {name: module.function(name) for name in names}
-    known: dict[str, Callable[..., Sequence[float]]] = {}
+    raising_functions: dict[str, Callable[..., Sequence[float]]] = {}
     functions: dict[str, Function] = {}
     for name in _in_order(programs):
-        known[name] = compile_program(programs[name], {**MATH_FUNCTIONS, **known})
-        functions[name] = without_errors(known[name], len(programs[name].outputs))
+        raising_functions[name] = compile_program(
+            programs[name], {**MATH_FUNCTIONS, **raising_functions}
+        )
+        functions[name] = without_errors(
+            raising_functions[name], len(programs[name].outputs)
+        )
     return {name: functions[name] for name in names}
 
 

@@ -62,25 +62,25 @@ _ON_FLOATS: dict[str, Callable[..., float]] = {
     for op, text in _TEMPLATES.items()
 }
 _SLOPE_RULES: dict[str, Callable[..., Value]] = {
-    "add": lambda here, x, y, dx, dy: dx + dy,
-    "sub": lambda here, x, y, dx, dy: dx - dy,
-    "mul": lambda here, x, y, dx, dy: dx * y + x * dy,
-    "div": lambda here, x, y, dx, dy: (dx - here * dy) / y,
-    "atan2": lambda here, y, x, dy, dx: (dy * x - y * dx) / (y * y + x * x),
-    "neg": lambda here, x: -1.0,
-    "sqrt": lambda here, x: 0.5 / here,
-    "tanh": lambda here, x: 1.0 - here * here,
-    "exp": lambda here, x: here,
-    "log": lambda here, x: 1.0 / x,
-    "sin": lambda here, x: x.apply("cos"),
-    "cos": lambda here, x: -x.apply("sin"),
-    "positive": lambda here, x: x.apply("step"),
-    "step": lambda here, x: 0.0,
-    "abs": lambda here, x: x.apply("select", x, 1.0, -1.0),
-    "max": lambda here, x, y, dx, dy: here.apply("select", y - x, dy, dx),
-    "select": lambda here, c, x, y, dc, dx, dy: here.apply("select", c, dx, dy),
+    "add": lambda f, x, y, dx, dy: dx + dy,
+    "sub": lambda f, x, y, dx, dy: dx - dy,
+    "mul": lambda f, x, y, dx, dy: dx * y + x * dy,
+    "div": lambda f, x, y, dx, dy: (dx - f * dy) / y,
+    "atan2": lambda f, y, x, dy, dx: (dy * x - y * dx) / (y * y + x * x),
+    "neg": lambda f, x: -1.0,
+    "sqrt": lambda f, x: 0.5 / f,
+    "tanh": lambda f, x: 1.0 - f * f,
+    "exp": lambda f, x: f,
+    "log": lambda f, x: 1.0 / x,
+    "sin": lambda f, x: x.apply("cos"),
+    "cos": lambda f, x: -x.apply("sin"),
+    "positive": lambda f, x: x.apply("step"),
+    "step": lambda f, x: 0.0,
+    "abs": lambda f, x: x.apply("select", x, 1.0, -1.0),
+    "max": lambda f, x, y, dx, dy: f.apply("select", y - x, dy, dx),
+    "select": lambda f, c, x, y, dc, dx, dy: f.apply("select", c, dx, dy),
 }
-"""Slopes of here = f(x, y), whose arguments have the slopes dx and dy.
+"""Slopes of f = f(x, y), whose arguments have the slopes dx and dy.
 
 Of f(x) without dx.
 """
@@ -116,7 +116,7 @@ class Graph:
 
     def __init__(self) -> None:
         self.nodes: list[tuple[Operation, tuple[Value, ...]]] = []
-        self._known: dict[tuple[Any, ...], Expression] = {}
+        self._expressions: dict[tuple[Any, ...], Expression] = {}
 
     def node(self, op: Operation, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
@@ -125,10 +125,10 @@ class Graph:
             for a in args
         ]
         key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
-        if key not in self._known:
-            self._known[key] = Expression(self, len(self.nodes))
+        if key not in self._expressions:
+            self._expressions[key] = Expression(self, len(self.nodes))
             self.nodes.append((op, args))
-        return self._known[key]
+        return self._expressions[key]
 
 
 class Expression:
@@ -145,59 +145,59 @@ class Expression:
     def __init__(self, graph: Graph, index: int, *, is_present: bool = False) -> None:
         self.graph, self.index, self.is_present = graph, index, is_present
 
-    def __add__(self, other: Value) -> Value:
-        if _is(other, 0.0):
+    def __add__(self, operand: Value) -> Value:
+        if _is(operand, 0.0):
             return self
-        mine, theirs = _drop_minus(self), _drop_minus(other)
+        mine, theirs = _drop_minus(self), _drop_minus(operand)
         if theirs is not None:
             return self - theirs
-        if mine is not None and isinstance(other, Expression):
-            return other - mine
-        return self.graph.node("add", self, other)
+        if mine is not None and isinstance(operand, Expression):
+            return operand - mine
+        return self.graph.node("add", self, operand)
 
     __radd__ = __add__
 
-    def __sub__(self, other: Value) -> Value:
-        if other is self:
+    def __sub__(self, operand: Value) -> Value:
+        if operand is self:
             return 0.0
-        if _is(other, 0.0):
+        if _is(operand, 0.0):
             return self
-        theirs = _drop_minus(other)
-        return (
-            self + theirs if theirs is not None else self.graph.node("sub", self, other)
-        )
+        theirs = _drop_minus(operand)
+        if theirs is not None:
+            return self + theirs
+        return self.graph.node("sub", self, operand)
 
-    def __rsub__(self, other: Value) -> Value:
-        return -self if _is(other, 0.0) else self.graph.node("sub", other, self)
+    def __rsub__(self, operand: Value) -> Value:
+        return -self if _is(operand, 0.0) else self.graph.node("sub", operand, self)
 
-    def __mul__(self, other: Value) -> Value:
-        if _is(other, 0.0):
+    def __mul__(self, operand: Value) -> Value:
+        if _is(operand, 0.0):
             return 0.0
-        if _is(other, 1.0) or _is(other, -1.0):
-            return self if other > 0.0 else -self
-        mine, theirs = _drop_minus(self), _drop_minus(other)
+        if _is(operand, 1.0) or _is(operand, -1.0):
+            return self if operand > 0.0 else -self
+        mine, theirs = _drop_minus(self), _drop_minus(operand)
         if mine is not None and theirs is not None:
             return mine * theirs
         if mine is not None:
-            return -(mine * other) if isinstance(other, Expression) else mine * -other
-        return (
-            -(self * theirs)
-            if theirs is not None
-            else self.graph.node("mul", self, other)
-        )
+            if isinstance(operand, Expression):
+                return -(mine * operand)
+            return mine * -operand
+        if theirs is not None:
+            return -(self * theirs)
+        return self.graph.node("mul", self, operand)
 
     __rmul__ = __mul__
 
-    def __truediv__(self, other: Value) -> Value:
-        if _is(other, 1.0) or _is(other, -1.0):
-            return self * other
+    def __truediv__(self, operand: Value) -> Value:
+        if _is(operand, 1.0) or _is(operand, -1.0):
+            return self * operand
         mine = _drop_minus(self)
-        return (
-            -(mine / other) if mine is not None else self.graph.node("div", self, other)
-        )
+        if mine is not None:
+            return -(mine / operand)
+        return self.graph.node("div", self, operand)
 
-    def __rtruediv__(self, other: Value) -> Value:
-        return 0.0 if _is(other, 0.0) else self.graph.node("div", other, self)
+    def __rtruediv__(self, operand: Value) -> Value:
+        return 0.0 if _is(operand, 0.0) else self.graph.node("div", operand, self)
 
     def __neg__(self) -> Value:
         mine = _drop_minus(self)
@@ -225,7 +225,14 @@ def _folds(
     op: str,
 ) -> tuple[Callable[[Number, Value], Value], Callable[[Number, Value], Value]]:
     """Return an operator of numbers and its reflected form."""
-    return lambda x, other: x.fold(op, x, other), lambda x, other: x.fold(op, other, x)
+
+    def operator(x: Number, operand: Value) -> Value:
+        return x.fold(op, x, operand)
+
+    def reflected(x: Number, operand: Value) -> Value:
+        return x.fold(op, operand, x)
+
+    return operator, reflected
 
 
 class Number(float):
@@ -325,14 +332,15 @@ class Program:
 
     def prune(self, outputs: Sequence[float | int]) -> Program:
         """Return the program of some outputs alone, without steps they do not need."""
-        inputs, needed = len(self.inputs), {x for x in outputs if isinstance(x, int)}
+        inputs = len(self.inputs)
+        needed = {x for x in outputs if isinstance(x, int)}
+        # Operands are earlier than their step: one pass from the last step finds all.
         for number in reversed(range(inputs, inputs + len(self.steps))):
             if number in needed:
-                needed.update(
-                    x for x in self.steps[number - inputs][1] if isinstance(x, int)
-                )
-        kept = sorted(number for number in needed if number >= inputs)
-        return self._part(self.inputs, range(inputs), kept, outputs)
+                _, operands = self.steps[number - inputs]
+                needed.update(x for x in operands if isinstance(x, int))
+        step_numbers = sorted(number for number in needed if number >= inputs)
+        return self._select_steps(self.inputs, range(inputs), step_numbers, outputs)
 
     def hoist(self, shared: int) -> tuple[Program, Program]:
         """Return what depends on the first `shared` inputs alone, and all the rest.
@@ -342,36 +350,47 @@ class Program:
         """
         inputs = len(self.inputs)
         is_late = [number >= shared for number in range(inputs)]
-        for op, given in self.steps:
+        for op, operands in self.steps:
             calls = isinstance(op, Routine) or op == "part"
             is_late.append(
-                calls or any(is_late[x] for x in given if isinstance(x, int))
+                calls or any(is_late[x] for x in operands if isinstance(x, int))
             )
         numbers = range(inputs, inputs + len(self.steps))
-        before = [number for number in numbers if not is_late[number]]
-        after = [number for number in numbers if is_late[number]]
-        operands = [x for number in after for x in self.steps[number - inputs][1]]
-        used = {x for x in (*operands, *self.outputs) if isinstance(x, int)}
-        early = sorted(x for x in used if not is_late[x])
-        names = (*(f"shared_{i}" for i in range(len(early))), *self.inputs[shared:])
-        first = self._part(self.inputs[:shared], range(shared), before, early)
-        rest = self._part(names, [*early, *range(shared, inputs)], after, self.outputs)
-        return first, rest
+        early_steps = [number for number in numbers if not is_late[number]]
+        late_steps = [number for number in numbers if is_late[number]]
+        late_operands = [
+            x for number in late_steps for x in self.steps[number - inputs][1]
+        ]
+        used = {x for x in (*late_operands, *self.outputs) if isinstance(x, int)}
+        shared_results = sorted(x for x in used if not is_late[x])
+        names = (
+            *(f"shared_{i}" for i in range(len(shared_results))),
+            *self.inputs[shared:],
+        )
+        early_program = self._select_steps(
+            self.inputs[:shared], range(shared), early_steps, shared_results
+        )
+        late_inputs = [*shared_results, *range(shared, inputs)]
+        late_program = self._select_steps(names, late_inputs, late_steps, self.outputs)
+        return early_program, late_program
 
-    def _part(
+    def _select_steps(
         self,
         names: tuple[str, ...],
-        given: Sequence[int],
-        kept: Sequence[int],
+        input_numbers: Sequence[int],
+        step_numbers: Sequence[int],
         outputs: Sequence[float | int],
     ) -> Program:
-        """Return the program of the steps `kept`, its inputs the operands `given`."""
-        places = {old: new for new, old in enumerate([*given, *kept])}
+        """Return the program of some steps.
+
+        Its inputs, by `names`, are the operands `input_numbers`.
+        """
+        places = {old: new for new, old in enumerate([*input_numbers, *step_numbers])}
 
         def renumber(operands: Sequence[float | int]) -> tuple[float | int, ...]:
             return tuple(places[x] if isinstance(x, int) else x for x in operands)
 
-        steps = (self.steps[number - len(self.inputs)] for number in kept)
+        steps = (self.steps[number - len(self.inputs)] for number in step_numbers)
         renumbered = tuple((op, renumber(operands)) for op, operands in steps)
         return Program(names, renumbered, renumber(outputs))
 
@@ -391,30 +410,36 @@ class Program:
         late: Container[int],
         templates: Mapping[str, str] = _TEMPLATES,
     ) -> tuple[list[str], list[str], list[str]]:
-        """Write lines v0 = .., v1 = .., a step each.
+        """Return the lines v0 = .., v1 = .., a step each, and the outputs.
 
-        Returns those that depend on no `late` input, the others, and the outputs.
+        First the lines that depend on no `late` input, then those that do, and then
+        the operands that are the outputs.
         """
-        words = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
+        operand_names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
         is_late = [number in late for number in range(len(self.inputs))]
 
-        def word(operand: float | int) -> str:
+        def write_operand(operand: float | int) -> str:
             if isinstance(operand, int):
-                return words[operand]
+                return operand_names[operand]
             return repr(operand) if operand >= 0.0 else f"({operand!r})"
 
-        before, after = list[str](), list[str]()
+        early_lines: list[str] = []
+        late_lines: list[str] = []
         for i, (op, operands) in enumerate(self.steps):
             is_late.append(any(is_late[x] for x in operands if isinstance(x, int)))
             if isinstance(op, Routine):
-                text = f"{op.name}({', '.join(map(word, operands))})"
+                text = f"{op.name}({', '.join(map(write_operand, operands))})"
             elif op == "part":
-                text = f"{word(operands[0])}[{int(operands[1])}]"
+                text = f"{write_operand(operands[0])}[{int(operands[1])}]"
             else:
-                text = templates[op].format(*map(word, operands))
+                text = templates[op].format(*map(write_operand, operands))
             line = f"v{i} = {text}"
-            (after if is_late[-1] else before).append(line)
-        return before, after, [word(output) for output in self.outputs]
+            if is_late[-1]:
+                late_lines.append(line)
+            else:
+                early_lines.append(line)
+        outputs = [write_operand(output) for output in self.outputs]
+        return early_lines, late_lines, outputs
 
 
 class Slots:
@@ -448,7 +473,8 @@ def trace(
     graph = Graph()
     names = tuple(inputs)
     outputs = tuple(function(*[graph.node("input", name) for name in names]))
-    results, nodes = list(outputs), graph.nodes[:]
+    results = list(outputs)
+    nodes = graph.nodes[:]  # those of the outputs: slopes add others to the graph
     for variable in by:
         results += _slopes_of(outputs, graph, nodes, {variable: 1.0})
     return _program_of(graph, names, results)
@@ -493,7 +519,7 @@ def _slopes_of(
     slopes: list[Value] = []
     for index, (op, args) in enumerate(nodes):
         d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
-        here = Expression(graph, index)
+        expression = Expression(graph, index)
         if isinstance(op, Routine):
             raise TypeError(
                 f"the program {op.name} is called: it has no derivative here"
@@ -501,11 +527,11 @@ def _slopes_of(
         if op == "input":
             slopes.append(slopes_of_inputs.get(args[0], 0.0))
         elif len(args) > 1:
-            slopes.append(_SLOPE_RULES[op](here, *args, *d))
+            slopes.append(_SLOPE_RULES[op](expression, *args, *d))
         elif _is(d[0], 0.0):
             slopes.append(0.0)
         else:
-            slopes.append(_SLOPE_RULES[op](here, *args) * d[0])
+            slopes.append(_SLOPE_RULES[op](expression, *args) * d[0])
     return [
         slopes[output.index] if isinstance(output, Expression) else 0.0
         for output in outputs
@@ -604,5 +630,7 @@ def _by_element(function: Callable[..., float]) -> Callable[..., Any]:
 
 def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
     """Divide numbers into tuples by name, as inputs of a program come."""
-    rest = iter(numbers)
-    return {name: tuple(islice(rest, size)) for name, size in sizes.items()}
+    remaining_numbers = iter(numbers)
+    return {
+        name: tuple(islice(remaining_numbers, size)) for name, size in sizes.items()
+    }

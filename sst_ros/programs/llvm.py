@@ -126,18 +126,18 @@ class RowFunction:
         """
         self._check_rows(inputs, outputs)
         begin, end, _ = columns.indices(len(outputs[0]))
-        whole = begin + (end - begin) // LANES * LANES
+        blocks_end = begin + (end - begin) // LANES * LANES
         scalars = (ctypes.c_double * (len(shared) + 1))(*shared)
-        if whole > begin:
+        if blocks_end > begin:
             ins = _addresses(inputs, begin)
-            self._run(whole - begin, scalars, ins, _addresses(outputs, begin))
-        if whole < end:  # the last columns, in rows that are as long as the lanes
-            count = end - whole
-            last = [np.resize(row[whole:end], LANES) for row in inputs]
+            self._run(blocks_end - begin, scalars, ins, _addresses(outputs, begin))
+        if blocks_end < end:  # the last columns, in rows that are as long as the lanes
+            count = end - blocks_end
+            last = [np.resize(row[blocks_end:end], LANES) for row in inputs]
             results = np.empty((self.outputs, LANES))
             self._run(LANES, scalars, _addresses(last, 0), _addresses([*results], 0))
             for row, result in zip(outputs, results, strict=True):
-                row[whole:end] = result[:count]
+                row[blocks_end:end] = result[:count]
 
     def compute_table(
         self, inputs: NDArray[np.float64], outputs: NDArray[np.float64]

@@ -62,23 +62,23 @@ def write_text(
     }
     narrow = set() if rows else set(programs)
     widths = sorted({1, lanes})
-    parts = [_declare(widths)]
+    sections = [_declare(widths)]
     if any(program.operations["tanh"] for program in programs.values()):
-        parts += [_write_tanh(width) for width in widths]
+        sections += [_write_tanh(width) for width in widths]
     for name, program in programs.items():
         if name in narrow:
-            parts.append(_write_function(name, program, slots, width=1))
+            sections.append(_write_function(name, program, slots, width=1))
         if name in wide:
-            parts.append(_write_function(name, program, slots, width=lanes))
+            sections.append(_write_function(name, program, slots, width=lanes))
     for name in rows:
         # What only shared inputs go into is computed once, not in each lane.
         before, body = programs[name].hoist(shared)
-        parts.append(_write_function(_before(name), before, slots, width=1))
-        parts.append(
+        sections.append(_write_function(_before(name), before, slots, width=1))
+        sections.append(
             _write_function(_body(name), body, slots, width=lanes, inline=True)
         )
-        parts.append(_write_loop(name, len(before.outputs), body, shared, lanes))
-    return ModuleText("\n".join(parts), tuple(slots.values))
+        sections.append(_write_loop(name, len(before.outputs), body, shared, lanes))
+    return ModuleText("\n".join(sections), tuple(slots.values))
 
 
 def row_name(name: str, shared: int) -> str:
@@ -109,9 +109,9 @@ def _type_of(width: int) -> str:
 def _declare(widths: Iterable[int]) -> str:
     lines = []
     for width in widths:
-        kind, suffix = _type_of(width), _suffix(width)
+        number_type, suffix = _type_of(width), _suffix(width)
         for name in ("sqrt", "fabs"):
-            lines.append(f"declare {kind} @llvm.{name}.{suffix}({kind})")
+            lines.append(f"declare {number_type} @llvm.{name}.{suffix}({number_type})")
     for name in MATH_FUNCTIONS:
         if name not in (*_INTRINSIC, "tanh"):
             arguments = "double, double" if name == "atan2" else "double"
@@ -142,8 +142,8 @@ def _whole_constant(value: int, width: int) -> str:
     return "<" + ", ".join([f"i64 {value}"] * width) + ">"
 
 
-def _pointer(kind: str) -> str:
-    return f"{kind}*"
+def _pointer(target_type: str) -> str:
+    return f"{target_type}*"
 
 
 def _write_function(
@@ -157,11 +157,11 @@ def _write_function(
     for number, (op, operands) in enumerate(program.steps):
         writer.write_step(f"%v{number}", op, operands)
     for number, output in enumerate(program.outputs):
-        writer.store(writer.word(output), "%o", number)
+        writer.store(writer.operand_text(output), "%o", number)
     array = f"{_pointer(_type_of(width))} noalias"
-    kind, end = ("internal ", " alwaysinline") if inline else ("", "")
-    head = f"define {kind}void {_function_name(name, width)}"
-    head += f"({array} %x, double* noalias %p, {array} %o){end} {{"
+    linkage, attribute = ("internal ", " alwaysinline") if inline else ("", "")
+    head = f"define {linkage}void {_function_name(name, width)}"
+    head += f"({array} %x, double* noalias %p, {array} %o){attribute} {{"
     return "\n".join([head, *writer.first_lines, *writer.lines, "  ret void", "}", ""])
 
 
@@ -171,33 +171,38 @@ def _write_tanh(width: int) -> str:
     writer = _Writer(program, Slots(), width)
     for number, (op, operands) in enumerate(program.steps):
         writer.write_step(f"%v{number}", op, operands)
-    kind = _type_of(width)
-    head = f"define internal {kind} {_function_name(_TANH, width)}({kind} %a0)"
-    end = f"  ret {kind} {writer.word(program.outputs[0])}"
-    return "\n".join([f"{head} alwaysinline {{", *writer.lines, end, "}", ""])
+    number_type = _type_of(width)
+    name = _function_name(_TANH, width)
+    head = f"define internal {number_type} {name}({number_type} %a0)"
+    last_line = f"  ret {number_type} {writer.operand_text(program.outputs[0])}"
+    return "\n".join([f"{head} alwaysinline {{", *writer.lines, last_line, "}", ""])
 
 
 class _Writer:
     """Lines of one function; `first_lines` are those at its begin."""
 
     def __init__(self, program: Program, slots: Slots, width: int) -> None:
-        self._slots, self._width, self._kind = slots, width, _type_of(width)
-        self._words = [f"%a{i}" for i in range(len(program.inputs))]
-        self._words += [f"%v{i}" for i in range(len(program.steps))]
+        self._slots = slots
+        self._width = width
+        self._number_type = _type_of(width)
+        self._operand_names = [f"%a{i}" for i in range(len(program.inputs))]
+        self._operand_names += [f"%v{i}" for i in range(len(program.steps))]
         self._numbers: dict[int, str] = {}
         self._calls: dict[str, str] = {}
         self._places = 0
         self.first_lines: list[str] = []
         self.lines: list[str] = []
         for number in range(len(program.inputs)):
-            self.first_lines += self._load(f"%a{number}", self._kind, "%x", number)
+            self.first_lines += self._load(
+                f"%a{number}", self._number_type, "%x", number
+            )
 
-    def word(self, operand: float | int) -> str:
+    def operand_text(self, operand: float | int) -> str:
         """Return how an operand is named in the text."""
         if isinstance(operand, Number):
             return self._number(self._slots.slot(operand))
         if isinstance(operand, int):
-            return self._words[operand]
+            return self._operand_names[operand]
         return _constant(operand, self._width)
 
     def write_step(
@@ -209,39 +214,44 @@ class _Writer:
             return
         if op == "part":
             call, place = operands
-            results = self._calls[self._words[int(call)]]
-            self.lines += self._load(result, self._kind, results, int(place))
+            results = self._calls[self._operand_names[int(call)]]
+            self.lines += self._load(result, self._number_type, results, int(place))
             return
-        kind, words = self._kind, [self.word(operand) for operand in operands]
+        number_type = self._number_type
+        texts = [self.operand_text(operand) for operand in operands]
         if op in _ARITHMETIC:
-            self._put(result, f"{_ARITHMETIC[op]} {kind} {words[0]}, {words[1]}")
+            self._put(result, f"{_ARITHMETIC[op]} {number_type} {texts[0]}, {texts[1]}")
         elif op == "neg":
-            self._put(result, f"fneg {kind} {words[0]}")
+            self._put(result, f"fneg {number_type} {texts[0]}")
         elif op in _INTRINSIC:
             name = f"@llvm.{'fabs' if op == 'abs' else op}.{_suffix(self._width)}"
-            self._put(result, f"call {kind} {name}({kind} {words[0]})")
+            self._put(result, f"call {number_type} {name}({number_type} {texts[0]})")
         elif op == "tanh":
             name = _function_name(_TANH, self._width)
-            self._put(result, f"call {kind} {name}({kind} {words[0]})")
+            self._put(result, f"call {number_type} {name}({number_type} {texts[0]})")
         elif op == "power_of_two":
-            self._write_power_of_two(result, words[0])
+            self._write_power_of_two(result, texts[0])
         elif op == "positive":
-            self._choose(result, self.word(0.0), words[0], self.word(0.0), words[0])
+            zero = self.operand_text(0.0)
+            self._choose(result, zero, texts[0], zero, texts[0])
         elif op == "step":
-            one, zero = self.word(1.0), self.word(0.0)
-            self._choose(result, words[0], zero, one, zero)
+            one, zero = self.operand_text(1.0), self.operand_text(0.0)
+            self._choose(result, texts[0], zero, one, zero)
         elif op == "max":
-            self._choose(result, words[1], words[0], words[1], words[0])
+            self._choose(result, texts[1], texts[0], texts[1], texts[0])
         elif op == "select":
-            self._choose(result, words[0], self.word(0.0), words[1], words[2])
+            self._choose(result, texts[0], self.operand_text(0.0), texts[1], texts[2])
         else:
-            self._call_libm(result, op, words)
+            self._call_libm(result, op, texts)
 
-    def store(self, word: str, array: str, place: int) -> None:
+    def store(self, number_text: str, array: str, place: int) -> None:
         """Write a number into a place of an array."""
         address = self._address(self.lines, array, place)
-        kind = self._kind
-        self.lines.append(f"  store {kind} {word}, {_pointer(kind)} {address}, align 8")
+        number_type = self._number_type
+        self.lines.append(
+            f"  store {number_type} {number_text}, {_pointer(number_type)} {address},"
+            " align 8"
+        )
 
     def _put(self, result: str, text: str) -> None:
         self.lines.append(f"  {result} = {text}")
@@ -250,41 +260,46 @@ class _Writer:
         """Write: yes where left > right, else no."""
         truth = "i1" if self._width == 1 else f"<{self._width} x i1>"
         condition = f"%c{result[1:]}"
-        self._put(condition, f"fcmp ogt {self._kind} {left}, {right}")
+        self._put(condition, f"fcmp ogt {self._number_type} {left}, {right}")
         self._put(
             result,
-            f"select {truth} {condition}, {self._kind} {yes}, {self._kind} {no}",
+            f"select {truth} {condition}, {self._number_type} {yes},"
+            f" {self._number_type} {no}",
         )
 
-    def _write_power_of_two(self, result: str, word: str) -> None:
+    def _write_power_of_two(self, result: str, exponent: str) -> None:
         """Write 2^k: k is added to the exponent of 1.
 
         The low bits of k + TO_WHOLE are those of k as a whole number. A conversion
         would have no value where k is no number.
         """
-        kind = self._kind
-        whole = "i64" if self._width == 1 else f"<{self._width} x i64>"
-        place, one = (_whole_constant(n, self._width) for n in (52, 1023 << 52))
+        number_type = self._number_type
+        integer_type = "i64" if self._width == 1 else f"<{self._width} x i64>"
+        mantissa_size = _whole_constant(52, self._width)
+        bits_of_one = _whole_constant(1023 << 52, self._width)
         name = f"%w{result[1:]}"
-        self._put(f"{name}.k", f"fadd {kind} {word}, {self.word(TO_WHOLE)}")
-        self._put(f"{name}.i", f"bitcast {kind} {name}.k to {whole}")
-        self._put(f"{name}.e", f"shl {whole} {name}.i, {place}")
-        self._put(f"{name}.b", f"add {whole} {name}.e, {one}")
-        self._put(result, f"bitcast {whole} {name}.b to {kind}")
+        self._put(
+            f"{name}.k", f"fadd {number_type} {exponent}, {self.operand_text(TO_WHOLE)}"
+        )
+        self._put(f"{name}.i", f"bitcast {number_type} {name}.k to {integer_type}")
+        self._put(f"{name}.e", f"shl {integer_type} {name}.i, {mantissa_size}")
+        self._put(f"{name}.b", f"add {integer_type} {name}.e, {bits_of_one}")
+        self._put(result, f"bitcast {integer_type} {name}.b to {number_type}")
 
-    def _call_libm(self, result: str, name: str, words: Sequence[str]) -> None:
+    def _call_libm(self, result: str, name: str, texts: Sequence[str]) -> None:
         """Call a function of libm lane by lane, so each lane has Python's bits."""
         if self._width == 1:
-            arguments = ", ".join(f"double {word}" for word in words)
+            arguments = ", ".join(f"double {text}" for text in texts)
             self._put(result, f"call double @{name}({arguments})")
             return
         vector = "undef"
         for lane in range(self._width):
             numbers = []
-            for k, word in enumerate(words):
+            for k, text in enumerate(texts):
                 numbers.append(f"{result}.{lane}.{k}")
                 self._put(
-                    numbers[-1], f"extractelement {self._kind} {word}, i32 {lane}"
+                    numbers[-1],
+                    f"extractelement {self._number_type} {text}, i32 {lane}",
                 )
             arguments = ", ".join(f"double {number}" for number in numbers)
             self._put(f"{result}.{lane}", f"call double @{name}({arguments})")
@@ -292,8 +307,8 @@ class _Writer:
             filled = result if last else f"{result}.{lane}.v"
             self._put(
                 filled,
-                f"insertelement {self._kind} {vector}, double {result}.{lane}, i32"
-                f" {lane}",
+                f"insertelement {self._number_type} {vector}, double {result}.{lane},"
+                f" i32 {lane}",
             )
             vector = filled
 
@@ -305,15 +320,17 @@ class _Writer:
         results = self._new_array(f"{result}.o", routine.outputs)
         self._calls[result] = results
         for place, operand in enumerate(operands):
-            self.store(self.word(operand), arguments, place)
+            self.store(self.operand_text(operand), arguments, place)
         name = _function_name(routine.name, self._width)
-        array = _pointer(self._kind)
+        array = _pointer(self._number_type)
         self.lines.append(
             f"  call void {name}({array} {arguments}, double* %p, {array} {results})"
         )
 
     def _new_array(self, name: str, size: int) -> str:
-        self.first_lines.append(f"  {name} = alloca {self._kind}, i32 {size}, align 32")
+        self.first_lines.append(
+            f"  {name} = alloca {self._number_type}, i32 {size}, align 32"
+        )
         return name
 
     def _number(self, slot: int) -> str:
@@ -328,42 +345,57 @@ class _Writer:
             self._numbers[slot] = name
         return self._numbers[slot]
 
-    def _load(self, result: str, kind: str, array: str, place: int) -> list[str]:
+    def _load(
+        self, result: str, element_type: str, array: str, place: int
+    ) -> list[str]:
         lines: list[str] = []
-        address = self._address(lines, array, place, kind)
-        return [
-            *lines,
-            f"  {result} = load {kind}, {_pointer(kind)} {address}, align 8",
-        ]
+        address = self._address(lines, array, place, element_type)
+        pointer = _pointer(element_type)
+        lines.append(f"  {result} = load {element_type}, {pointer} {address}, align 8")
+        return lines
 
     def _address(
-        self, lines: list[str], array: str, place: int, kind: str | None = None
+        self, lines: list[str], array: str, place: int, element_type: str | None = None
     ) -> str:
         address = f"%q{self._places}"
         self._places += 1
-        kind = kind or self._kind
-        lines.append(_element(address, kind, array, place))
+        element_type = element_type or self._number_type
+        lines.append(_element(address, element_type, array, place))
         return address
 
 
-def _element(result: str, kind: str, array: str, place: int | str) -> str:
+def _element(result: str, element_type: str, array: str, place: int | str) -> str:
     """Line that takes the address of an element of an array."""
     return (
-        f"  {result} = getelementptr inbounds {kind}, {_pointer(kind)} {array}, i64"
-        f" {place}"
+        f"  {result} = getelementptr inbounds {element_type},"
+        f" {_pointer(element_type)} {array}, i64 {place}"
     )
 
 
 def _splat(result: str, scalar: str, width: int) -> list[str]:
     """Lines that give all lanes one number."""
-    kind = _type_of(width)
+    vector_type = _type_of(width)
     return [
-        f"  {result}.1 = insertelement {kind} undef, double {scalar}, i32 0",
+        f"  {result}.1 = insertelement {vector_type} undef, double {scalar}, i32 0",
         (
-            f"  {result} = shufflevector {kind} {result}.1, {kind} undef, "
-            f"<{width} x i32> zeroinitializer"
+            f"  {result} = shufflevector {vector_type} {result}.1, {vector_type} undef,"
+            f" <{width} x i32> zeroinitializer"
         ),
     ]
+
+
+def _spread_early(early: int, lanes: int) -> list[str]:
+    """Lines that give all lanes what `_write_loop` computes before the loop."""
+    vector_type = _type_of(lanes)
+    lines: list[str] = []
+    for i in range(early):
+        lines.append(_element(f"%e{i}.a", "double", "%e", i))
+        lines.append(f"  %e{i}.s = load double, double* %e{i}.a, align 8")
+        lines += _splat(f"%e{i}", f"%e{i}.s", lanes)
+        lines.append(_element(f"%x{i}", vector_type, "%x", i))
+        pointer = _pointer(vector_type)
+        lines.append(f"  store {vector_type} %e{i}, {pointer} %x{i}, align 8")
+    return lines
 
 
 def _write_loop(
@@ -374,28 +406,24 @@ def _write_loop(
     `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes. The
     first `early` inputs of the program are what is computed before the loop.
     """
-    kind, count = _type_of(lanes), len(program.inputs)
-    array = _pointer(kind)
+    vector_type = _type_of(lanes)
+    count = len(program.inputs)
+    array = _pointer(vector_type)
     lines = [
         (
             f"define void @{row_name(name, shared)}"
             "(i64 %n, double* %s, double* %p, double** %ins, double** %outs) {"
         ),
         "entry:",
-        f"  %x = alloca {kind}, i32 {count}, align 32",
-        f"  %o = alloca {kind}, i32 {len(program.outputs)}, align 32",
+        f"  %x = alloca {vector_type}, i32 {count}, align 32",
+        f"  %o = alloca {vector_type}, i32 {len(program.outputs)}, align 32",
         f"  %e = alloca double, i32 {early}, align 32",
         (
             f"  call void {_function_name(_before(name), 1)}(double* %s, double* %p,"
             " double* %e)"
         ),
     ]
-    for i in range(early):
-        lines.append(_element(f"%e{i}.a", "double", "%e", i))
-        lines.append(f"  %e{i}.s = load double, double* %e{i}.a, align 8")
-        lines += _splat(f"%e{i}", f"%e{i}.s", lanes)
-        lines.append(_element(f"%x{i}", kind, "%x", i))
-        lines.append(f"  store {kind} %e{i}, {array} %x{i}, align 8")
+    lines += _spread_early(early, lanes)
     for i in range(early, count):
         lines.append(_element(f"%r{i}.a", "double*", "%ins", i - early))
         lines.append(f"  %r{i} = load double*, double** %r{i}.a, align 8")
@@ -410,17 +438,17 @@ def _write_loop(
     for i in range(early, count):
         lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
         lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
-        lines.append(f"  %l{i} = load {kind}, {array} %l{i}.v, align 8")
-        lines.append(_element(f"%x{i}", kind, "%x", i))
-        lines.append(f"  store {kind} %l{i}, {array} %x{i}, align 8")
+        lines.append(f"  %l{i} = load {vector_type}, {array} %l{i}.v, align 8")
+        lines.append(_element(f"%x{i}", vector_type, "%x", i))
+        lines.append(f"  store {vector_type} %l{i}, {array} %x{i}, align 8")
     call = _function_name(_body(name), lanes)
     lines.append(f"  call void {call}({array} %x, double* %p, {array} %o)")
     for i in range(len(program.outputs)):
-        lines.append(_element(f"%o{i}.a", kind, "%o", i))
-        lines.append(f"  %o{i} = load {kind}, {array} %o{i}.a, align 8")
+        lines.append(_element(f"%o{i}.a", vector_type, "%o", i))
+        lines.append(f"  %o{i} = load {vector_type}, {array} %o{i}.a, align 8")
         lines.append(_element(f"%t{i}", "double", f"%w{i}", "%k"))
         lines.append(f"  %t{i}.v = bitcast double* %t{i} to {array}")
-        lines.append(f"  store {kind} %o{i}, {array} %t{i}.v, align 8")
+        lines.append(f"  store {vector_type} %o{i}, {array} %t{i}.v, align 8")
     lines += [
         f"  %next = add i64 %k, {lanes}",
         "  %more = icmp slt i64 %next, %n",

@@ -56,7 +56,6 @@ from sst_ros.proof.balls import (
     arb,
     arb_mat,
     arb_poly,
-    arb_series,
     between,
     norm,
     precision,
@@ -301,7 +300,11 @@ class BallEquations:
             torque_piece = self._profile.piece(begin, end)
 
         def commanded(time: Any, *y: Any) -> Sequence[Any]:
-            command = [_ball_or_series(x) for x in torque_piece.at(time)]
+            held_torque = torque_piece.held
+            if held_torque is None:
+                command = torque_piece.at(time)
+            else:
+                command = tuple(map(arb, held_torque))
             return function(time, *y[:size], *command, *y[size:])
 
         return commanded
@@ -436,11 +439,6 @@ class BallEquations:
 
         inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
         return self.balls.compile(distances, inputs)
-
-
-def _ball_or_series(torque: Any) -> Any:
-    """Return the ball of a number; a series of the time stays one."""
-    return torque if isinstance(torque, arb_series) else arb(torque)
 
 
 def _start_equations(orientation: Quadruple) -> Callable[..., list[Any]]:

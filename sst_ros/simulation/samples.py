@@ -95,8 +95,8 @@ class Samples:
         t = np.array(self._times)
         states = np.empty((len(t), len(self._stepper.ode.state)))
         if self._states:
-            rows, known = zip(*self._states, strict=True)
-            states[list(rows)] = known
+            rows, noted_states = zip(*self._states, strict=True)
+            states[list(rows)] = noted_states
         self._step_to(t, states)
         joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE_NUMBERS])
         torque = self._torque_at(t, states, joints)
@@ -130,9 +130,9 @@ class Samples:
             if isinstance(torque, tuple):
                 torques[first:end] = torque
             elif torque.feedback:
-                part = slice(first, end)
-                rows = (array[part].tolist() for array in (t, states, joints))
-                torques[part] = [
+                span = slice(first, end)
+                rows = (array[span].tolist() for array in (t, states, joints))
+                torques[span] = [
                     applied.of_state(torque, time, state, angles)
                     for time, state, angles in zip(*rows, strict=True)
                 ]

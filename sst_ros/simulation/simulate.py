@@ -45,17 +45,20 @@ _MOST_PERIODS = WHOLE_MOTION_BUDGET // (3 * len(DORMAND_PRINCE.a))
 A step and its check are three steps.
 """
 
-_DEFAULT_SAMPLES, _MOST_SAMPLES = 200, 10_000_000
-"""Even intervals of a motion by default, and the most."""
+_DEFAULT_SAMPLES = 200
+"""Even intervals of a motion by default: smooth curves in a figure."""
+_MOST_SAMPLES = 10_000_000
+"""Most intervals of a motion: each has 29 numbers, 2.3 GB in all."""
 
 _RUN_ATTEMPTS = 4
 """Runs until the error estimate is at most the tolerance."""
 _FINEST = 1e-14
 """Least tolerance of a step: below it rounding decides."""
 _LEAST_GAIN = 0.5
-"""Share of the error: a run that keeps more of it is the last.
+"""Share of the last run's error: a run that keeps more of it is the last.
 
-The run is one by a fifth of the tolerance or less.
+Its steps have a fifth of the tolerance or less, so the error of a smooth motion falls
+farther; under torques that switch with the state it does not.
 """
 _FUNCTION_BUDGET = 1_000_000
 """Evaluations where each calls a function of the state: half a minute."""
@@ -68,7 +71,7 @@ _ADVICE = (
     " controller has it, or smooth the switch"
 )
 
-_UNSEEN = 10.0
+_UNSEEN_ANSWER = 10.0
 """Factor of the error estimate where it cannot see how a controller answers the error:
 of 170 random runs one has an error of more than ten times the estimate without that
 answer.
@@ -169,9 +172,18 @@ def simulate(
     parameters = _read_parameters(sensitivities, moving, profile)
     # Run it until its error estimate meets the tolerance.
     task = Task(
-        moving, profile, (0.0, span_ns / NANOSECONDS), times, method, tolerance,
-        period, memoryless, jumps, longest, parameters,
-    )  # fmt: skip
+        scene=moving,
+        torque=profile,
+        span=(0.0, span_ns / NANOSECONDS),
+        times=times,
+        method=method,
+        tolerance=tolerance,
+        period=period,
+        memoryless=memoryless,
+        breaks=jumps,
+        max_step=longest,
+        parameters=parameters,
+    )
     return _run_to_tolerance(task, progress=progress)
 
 
@@ -179,7 +191,9 @@ def _read_torque(torque: TorqueLike, scene: Scene) -> TorqueProfile:
     """Return the torques as a profile, by default those of the scene, or zero."""
     if torque is None:
         torque = scene.torque
-    return profile_of((0.0, 0.0, 0.0) if torque is None else torque)
+    if torque is None:
+        torque = (0.0, 0.0, 0.0)
+    return profile_of(torque)
 
 
 def _read_duration(duration: float | None, scene: Scene) -> int:
@@ -204,16 +218,16 @@ def _read_longest_step(max_step: float | None, span_ns: int) -> float:
     """Return the longest step [s]."""
     longest = math.inf if max_step is None else float(max_step)
     least = span_ns / NANOSECONDS / _MOST_PERIODS
-    allowed = f"must be > 0 s, at least {least:.3g} s for this duration"
-    refuse_unless("simulate", ("max_step", max_step, longest >= least, allowed))
+    requirement = f"must be > 0 s, at least {least:.3g} s for this duration"
+    refuse_unless("simulate", ("max_step", max_step, longest >= least, requirement))
     return longest
 
 
 def _read_breaks(breaks: TimesLike, span_ns: int) -> Array:
     """Return the times inside the motion [s] at which a function jumps."""
     times = np.atleast_1d(read_numbers("simulate", "breaks", breaks, seconds=True))
-    allowed = "must be ascending times [s]"
-    refuse_unless("simulate", ("breaks", breaks, ascend(times), allowed))
+    requirement = "must be ascending times [s]"
+    refuse_unless("simulate", ("breaks", breaks, ascend(times), requirement))
     return np.asarray(times[(times > 0.0) & (times < span_ns / NANOSECONDS)])
 
 
@@ -238,7 +252,9 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
     """
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
-    local, kept, last = task.tolerance, None, math.inf
+    local = task.tolerance  # of a step
+    kept: SteppedMotion | None = None
+    last_excess = math.inf
     for _ in range(_RUN_ATTEMPTS):
         attempt = task if local == task.tolerance else replace(task, tolerance=local)
         motion = SteppedMotion(
@@ -247,16 +263,18 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
         if kept is not None and motion.status < 0:
             break
         kept = motion
-        excess = motion.at.error / task.tolerance
-        # as under torques that switch with the state
-        hopeless = excess > _LEAST_GAIN * last
-        if remembers or motion.status < 0 or not excess > 1.0 or hopeless:
+        excess = motion.point.error / task.tolerance
+        is_met = not excess > 1.0
+        gains_little = excess > _LEAST_GAIN * last_excess
+        if remembers or motion.status < 0 or is_met or gains_little:
             break
-        last = excess
+        last_excess = excess
         local = max(local / (5.0 * excess), _FINEST)
     assert kept is not None
-    unseen = remembers and task.torque.feedback
-    return _trajectory(task, kept, budget.spent, factor=_UNSEEN if unseen else 1.0)
+    factor = 1.0
+    if remembers and task.torque.feedback:
+        factor = _UNSEEN_ANSWER  # the controller's, to the error
+    return _trajectory(task, kept, budget.spent, factor=factor)
 
 
 def _budget_of(task: Task) -> int:
@@ -275,7 +293,9 @@ def _trajectory(
 
     Its error estimate is `factor` times that of the steps.
     """
-    point, error, message = motion.at, factor * motion.at.error, motion.message
+    point = motion.point
+    error = factor * point.error
+    message = motion.message
     if motion.status < 0:
         numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
         message = f"{message} ({numbers})"
@@ -287,7 +307,10 @@ def _trajectory(
             f"{message} ({factor:g} times wider, as the function may have a memory)"
         )
     samples = motion.samples.table()
-    changes = [f"{to} from {at:g} s ({why})" for at, to, why in point.changes]
+    changes = [
+        f"{change.method} from {change.time:g} s ({change.reason})"
+        for change in point.changes
+    ]
     law = task.torque
     if motion.held:
         law = TorqueTable(*zip(*motion.held, strict=True))
@@ -313,8 +336,8 @@ def _trajectory(
     )
 
 
-def _refuse(name: str, value: object, allowed: str) -> NoReturn:
-    raise refusal("simulate", name, value, allowed) from None
+def _refuse(name: str, value: object, requirement: str) -> NoReturn:
+    raise refusal("simulate", name, value, requirement) from None
 
 
 def _allow_methods(method: object) -> str:

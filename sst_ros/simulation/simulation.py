@@ -90,14 +90,14 @@ def default_budget(dynamics: Dynamics, equations: str) -> int:
     )
 
 
-def _whole(value: Any) -> int:
+def _read_whole(value: Any) -> int:
     """Return a whole number below 2^63 of any type as int, 0 for anything else."""
     try:
         is_duration = isinstance(value, (bool, np.timedelta64))
-        found = 0 if is_duration else operator.index(value)
+        number = 0 if is_duration else operator.index(value)
     except TypeError:
         return 0
-    return found if found < 2**63 else 0
+    return number if number < 2**63 else 0
 
 
 def _one_of(names: tuple[str, ...]) -> str:
@@ -189,7 +189,7 @@ class Simulation(Explained):
         )
         self._lags = scene.lags
         self._start = self._stepper.begin(list(start_of(scene)))
-        self._now = self._before = _Instant(0, self._start)
+        self._current = self._before = _Instant(0, self._start)
         self.reset()
 
     def step(
@@ -243,12 +243,12 @@ class Simulation(Explained):
         moment: Vector3,
     ) -> tuple[Torque, int, int]:
         """Return what acts, the length of a step [ns] and the number of steps."""
-        length = _whole(dt_ns)
-        number = _whole(count)
-        held = finite_vector(torque)
+        length = _read_whole(dt_ns)
+        number = _read_whole(count)
+        constant_torque = finite_vector(torque)
         are_counted = length > 0 and 0 < number <= _MOST_CALL_STEPS
-        if held is None or finite_vector(moment) is None or not are_counted:
-            is_torque = held is not None or callable(torque)
+        if constant_torque is None or finite_vector(moment) is None or not are_counted:
+            is_torque = constant_torque is not None or callable(torque)
             is_torque = is_torque or isinstance(torque, TorqueProfile)
             is_moment = finite_vector(moment) is not None
             refuse_unless(
@@ -258,31 +258,31 @@ class Simulation(Explained):
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
                 ("count", count, 0 < number <= _MOST_CALL_STEPS, _COUNT),
             )
-        if held is None:
+        if constant_torque is None:
             return self.acting(torque), length, number
-        return self._stepper.torque.acting(held), length, number
+        return self._stepper.torque.acting(constant_torque), length, number
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy the arguments, and where the run is."""
         arguments = self.scene, *self._settings, self.step_budget
         spent = self._stepper.budget.spent
-        return _continue_simulation, (arguments, (self._before, self._now), spent)
+        return _continue_simulation, (arguments, (self._before, self._current), spent)
 
     def _claim(self) -> None:
         """Begin to advance; refuse another thread until `_running` is released."""
         if not self._running.acquire(blocking=False):
             names = {thread.ident: thread.name for thread in threading.enumerate()}
-            here = threading.current_thread().name
-            other = names.get(self._thread, "another thread")
-            allowed = f"must wait: {other} advances the simulation"
-            raise refusal("step", "thread", here, allowed)
+            thread_name = threading.current_thread().name
+            running_name = names.get(self._thread, "another thread")
+            requirement = f"must wait: {running_name} advances the simulation"
+            raise refusal("step", "thread", thread_name, requirement)
         self._thread = threading.get_ident()
 
     def acting(self, torque: Torque | TorqueFunction) -> Torque:
         """Return what acts: finite torques [N m] within the limit of the actuators."""
-        held = finite_vector(torque)
-        if held is not None:
-            return self._stepper.torque.acting(held)
+        constant_torque = finite_vector(torque)
+        if constant_torque is not None:
+            return self._stepper.torque.acting(constant_torque)
         if not isinstance(torque, TorqueProfile):
             is_function = callable(torque) and count_arguments(torque) == 1
             refuse_unless("step", ("torque", torque, is_function, _TORQUE_WORDS))
@@ -299,21 +299,23 @@ class Simulation(Explained):
             acting_moment = tuple(map(float, moment))
         # One thread at a time: what follows reads where the run is, and moves it.
         self._claim()
-        began = self._now
+        began = self._current
         try:
             for _ in range(count):
-                now = self._now
-                start = now.time_ns / NANOSECONDS
+                instant = self._current
+                start = instant.time_ns / NANOSECONDS
                 # Take steps of the integrator up to the end of the period.
                 try:
                     point = self._stepper.advance(
-                        now.point, start, h, torque, acting_moment
+                        instant.point, start, h, torque, acting_moment
                     )
                 except (LimitReached, CannotStep) as stop:
                     raise self._explain(stop, start) from None
                 # What it reached is the state now; until here nothing has changed.
                 self._before = began
-                self._now = _Instant(now.time_ns + dt_ns, point, torque, acting_moment)
+                self._current = _Instant(
+                    instant.time_ns + dt_ns, point, torque, acting_moment
+                )
         finally:
             self._running.release()
 
@@ -322,9 +324,9 @@ class Simulation(Explained):
         if isinstance(stop, LimitReached):
             assert stop.limit.error is not None
             return stop.limit.error(stop.limit.reason, stop.time, self.state)
-        near = describe_conditioning(self.geometry, self.state)
-        kind = StepBudgetExceeded if isinstance(stop, BudgetSpent) else Diverged
-        return kind(f"{stop} ({near})", start, self.state)
+        conditioning_text = describe_conditioning(self.geometry, self.state)
+        error_class = StepBudgetExceeded if isinstance(stop, BudgetSpent) else Diverged
+        return error_class(f"{stop} ({conditioning_text})", start, self.state)
 
     @check_kinds
     def within(self, time_ns: int) -> State:
@@ -337,13 +339,16 @@ class Simulation(Explained):
             InputError: the time is not inside the last step.
 
         """
-        began, end = self._before.time_ns, self._now.time_ns
-        allowed = f"must lie in the last step, {began} to {end} ns"
-        refuse_unless("within", ("time_ns", time_ns, began <= time_ns <= end, allowed))
+        began, end = self._before.time_ns, self._current.time_ns
+        requirement = f"must lie in the last step, {began} to {end} ns"
+        refuse_unless(
+            "within", ("time_ns", time_ns, began <= time_ns <= end, requirement)
+        )
         if time_ns == began:
             return self._as_state(self._before)
-        start, h = began / NANOSECONDS, (time_ns - began) / NANOSECONDS
-        _, _, torque, moment = self._now
+        start = began / NANOSECONDS
+        h = (time_ns - began) / NANOSECONDS
+        _, _, torque, moment = self._current
         point = self._stepper.advance(self._before.point, start, h, torque, moment)
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
@@ -351,8 +356,8 @@ class Simulation(Explained):
         """Go back to the initial state at time zero."""
         self._claim()
         try:
-            self._now = self._before = _Instant(0, self._start)
-            self._shown = self._now, self._as_state(self._now)
+            self._current = self._before = _Instant(0, self._start)
+            self._shown_state = self._current, self._as_state(self._current)
             self._energy = self.dynamics.total_energy(self._start.y)
         finally:
             self._running.release()
@@ -369,10 +374,10 @@ class Simulation(Explained):
     @property
     def state(self) -> State:
         """The last valid state."""
-        now = self._now
-        if self._shown[0] is not now:
-            self._shown = now, self._as_state(now)
-        return self._shown[1]
+        instant = self._current
+        if self._shown_state[0] is not instant:
+            self._shown_state = instant, self._as_state(instant)
+        return self._shown_state[1]
 
     @property
     def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
@@ -381,8 +386,8 @@ class Simulation(Explained):
         Quaternion and body rate come first, then nine angles and nine rates, then
         torques.
         """
-        now = self._now
-        return now.point.y, now.point.joints, self._torque(now)
+        instant = self._current
+        return instant.point.y, instant.point.joints, self._torque(instant)
 
     @property
     def body_acceleration(self) -> Vector3:
@@ -391,31 +396,31 @@ class Simulation(Explained):
         That under the torques and the moment of the last step; the next one may have
         others.
         """
-        now = self._now
-        moment = (now.moment or ZERO) if self.dynamics.has_moment_topic else ()
-        state = now.point.y[: len(self.dynamics.state)]
-        slope = self.dynamics.derivative(*state, *self._torque(now), *moment)
+        instant = self._current
+        moment = (instant.moment or ZERO) if self.dynamics.has_moment_topic else ()
+        state = instant.point.y[: len(self.dynamics.state)]
+        slope = self.dynamics.derivative(*state, *self._torque(instant), *moment)
         return triple(slope[4:7])
 
     @property
     def time_ns(self) -> int:
         """Time of the last valid state [ns]."""
-        return self._now.time_ns
+        return self._current.time_ns
 
     @property
     def method(self) -> str:
         """Name of the method in use."""
-        return self._now.point.method.name
+        return self._current.point.method.name
 
     @property
     def changes(self) -> list[MethodChange]:
         """Changes of method that auto has made: time [s], method, reason."""
-        return list(self._now.point.changes)
+        return list(self._current.point.changes)
 
     @property
     def accepted_steps(self) -> int:
         """Number of accepted steps of the integrator since the start."""
-        return self._now.point.steps
+        return self._current.point.steps
 
     @property
     def evaluations(self) -> int:
@@ -433,17 +438,17 @@ class Simulation(Explained):
         it holds where the error only halves with the steps, too. Not less than
         rounding.
         """
-        return self._now.point.error
+        return self._current.point.error
 
     @property
     def rate_error_estimate(self) -> float:
         """Estimated global error of the body rate [rad/s]."""
-        return self._now.point.rate_error
+        return self._current.point.rate_error
 
     @property
     def energy_residual(self) -> float:
         """Energy now, less that at the start, less work done on the manipulator [J]."""
-        y = self._now.point.y
+        y = self._current.point.y
         return self.dynamics.total_energy(y) - self._energy - y[-1]
 
     @property
@@ -473,13 +478,20 @@ class Simulation(Explained):
             "conditioning": describe_conditioning(self.geometry, self.state),
         }
 
-    def _as_state(self, at: _Instant) -> State:
-        return State.of(at.time_ns, at.point.y, at.point.joints, self._torque(at))
+    def _as_state(self, instant: _Instant) -> State:
+        return State.of(
+            instant.time_ns,
+            instant.point.y,
+            instant.point.joints,
+            self._torque(instant),
+        )
 
-    def _torque(self, at: _Instant) -> Vector3:
-        if type(at.torque) is tuple and not self._lags:
-            return at.torque
-        return self._stepper.acting(at.torque, at.time_ns / NANOSECONDS, at.point)
+    def _torque(self, instant: _Instant) -> Vector3:
+        if type(instant.torque) is tuple and not self._lags:
+            return instant.torque
+        return self._stepper.acting(
+            instant.torque, instant.time_ns / NANOSECONDS, instant.point
+        )
 
 
 def _continue_simulation(
@@ -490,7 +502,7 @@ def _continue_simulation(
     copied = Simulation(
         scene, integrator, tolerance=tolerance, equations=equations, step_budget=budget
     )
-    copied._before, copied._now = instants
+    copied._before, copied._current = instants
     copied._stepper.budget.spent = spent
     return copied
 

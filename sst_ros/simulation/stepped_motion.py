@@ -75,7 +75,7 @@ class SteppedMotion:
     Attributes:
         samples: those that were taken.
         held: times of control [s] and the torques from then on.
-        start, at, time: first and last valid point, and time of the last [s].
+        start, point, time: first and last valid point, and time of the last [s].
         status, message: 0 at the end, 1 at a limit, -1 where no step resolves the
             motion; why.
         stepper: what made the steps.
@@ -91,19 +91,24 @@ class SteppedMotion:
         limits: bool = True,
         progress: bool = False,
     ) -> None:
-        self._task, self._budget = task, budget
+        self._task = task
+        self._budget = budget
         self.stepper = Stepper(
             task.scene, task.method, task.tolerance, budget=budget, limits=limits,
             max_step=task.max_step,
         )  # fmt: skip
-        self.start = self.at = self.stepper.begin(list(y), _first_method(task))
-        self.time, self.status, self.message = task.span[0], 0, "reached the end"
+        self.start = self.point = self.stepper.begin(list(y), _first_method(task))
+        self.time = task.span[0]
+        self.status = 0
+        self.message = "reached the end"
         self.held: list[tuple[float, Vector3]] = []
         self.samples = Samples(self.stepper)
         self._times: list[float] = task.times.tolist()
         self._next = 0  # of the times that are not taken yet
         self._torque: Torque = (0.0, 0.0, 0.0)
-        self._other: Vector3 | None = None  # on the second solution, where they differ
+        self._second_torque: Vector3 | None = (
+            None  # on the second solution, where they differ
+        )
         self._segment = task.span
         self._moment = (0.0,) * len(self.stepper.dynamics.drive[3:])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
@@ -119,28 +124,31 @@ class SteppedMotion:
                 else:
                     self._hold_periods(self._task.period)
         except LimitReached as reached:
-            self.status, stop = 1, reached.limit.reason
+            self.status = 1
+            stop = reached.limit.reason
             end = math.floor(reached.time * NANOSECONDS) / NANOSECONDS
             self._take_between([end])
             self.time = reached.time
         except CannotStep as error:
-            self.status, stop = -1, str(error)
-            self._take(self.time, self.at.y)
+            self.status = -1
+            stop = str(error)
+            self._take(self.time, self.point.y)
         if self.status:
             self.message = f"stopped at t = {self.time:.12f} s: {stop}"
         return self
 
     def state(self) -> State:
         """Return the last valid state."""
-        return self._state_of(self.at, self._torque)
+        return self._state_of(self.point, self._torque)
 
-    def _state_of(self, at: Point, torque: Torque) -> State:
-        acting = self.stepper.acting(torque, self.time, at)
-        return State.of(round(self.time * NANOSECONDS), at.y, at.joints, acting)
+    def _state_of(self, point: Point, torque: Torque) -> State:
+        acting = self.stepper.acting(torque, self.time, point)
+        return State.of(round(self.time * NANOSECONDS), point.y, point.joints, acting)
 
     def _follow_profile(self) -> None:
         """Go through segments in each of which the torque is smooth."""
-        task, (begin, end) = self._task, self._task.span
+        task = self._task
+        begin, end = task.span
         kinks = task.torque.kinks(task.scene.torque_limit, end)
         if len(task.breaks) or len(kinks):
             kinks = np.union1d(task.breaks, kinks)
@@ -150,49 +158,55 @@ class SteppedMotion:
 
     def _hold_periods(self, period: int) -> None:
         """Go through control periods, which hold the torques of a function."""
-        task, end = self._task, round(self._task.span[1] * NANOSECONDS)
+        task = self._task
+        end = round(task.span[1] * NANOSECONDS)
         for start in range(0, end, period):
             time = start / NANOSECONDS
-            self._take_if_wanted(time, self.at.y)
+            self._take_if_wanted(time, self.point.y)
             state = (self.state(),) if task.torque.feedback else ()
-            held = task.torque.at(time, *state)
-            self.held.append((time, held))
+            torque = task.torque.at(time, *state)
+            self.held.append((time, torque))
             if task.torque.feedback and task.memoryless:
-                self._other = self._answer_second(time)
+                self._second_torque = self._answer_second(time)
             stop = min(start + period, end)
-            self._advance(time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, held)
+            self._advance(
+                time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, torque
+            )
 
     def _answer_second(self, time: float) -> Vector3:
         """Return what a function without memory gives to the second solution [N m]."""
-        at = self.stepper.begin(self.at.z)
-        before = self._torque if self._other is None else self._other
-        torque = self._task.torque.at(time, self._state_of(at, before))
+        point = self.stepper.begin(self.point.z)
+        before = self._torque if self._second_torque is None else self._second_torque
+        torque = self._task.torque.at(time, self._state_of(point, before))
         return clamp(torque, self.stepper.torque.limit)
 
     def _advance(self, begin: float, h: float, end: float, torque: Torque) -> None:
         """Go through a segment of length h under a torque, `begin` to `end` [s]."""
         self._segment = begin, end
         self._torque = self.stepper.torque.acting(torque)
-        self._take_if_wanted(begin, self.at.y)
+        self._take_if_wanted(begin, self.point.y)
         self.stepper.advance(
-            self.at,
+            self.point,
             begin,
             h,
             self._torque,
             self._moment,
-            other=self._other,
+            other=self._second_torque,
             visit=self._pass,
         )
 
     def _pass(self, step: Step) -> None:
         """Take the samples in a step, and note where the motion stands."""
-        self._last, self._last_begin = step, self._segment[0] + step.t
+        self._last = step
+        self._last_begin = self._segment[0] + step.t
         end = self._segment[1] if step.last else self._last_begin + step.h
         times = self._times
         if self._next < len(times) and times[self._next] < end:
-            first, self._next = self._next, bisect_left(times, end, self._next)
+            first = self._next
+            self._next = bisect_left(times, end, self._next)
             self._take_between(times[first : self._next])
-        self.time, self.at = end, step.end
+        self.time = end
+        self.point = step.end
         self._take_if_wanted(end, step.end.y)
         begin, last = self._task.span
         share = (end - begin) / (last - begin)
@@ -202,7 +216,8 @@ class SteppedMotion:
 
     def _take_between(self, times: list[float]) -> None:
         """Take samples at ascending times in the last step [s]."""
-        step, begin = self._last, self._last_begin
+        step = self._last
+        begin = self._last_begin
         if times[0] <= begin:  # the time of its begin, but for rounding
             self._take(times.pop(0), step.begin.y)
         states = self._interpolate(step, [time - begin for time in times])
@@ -214,12 +229,15 @@ class SteppedMotion:
 
     def _warn_if_hopeless(self, share: float) -> None:
         """Warn once if the rest of the motion would far exceed the budget."""
-        self._warn_after, most = math.inf, self._budget.per_period
+        self._warn_after = math.inf
+        most = self._budget.per_period
         spent = self._budget.spent - self._spent_before
         if _HOPELESS * most * share < spent:
-            done = f"{spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            progress_text = (
+                f"{spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            )
             advice = f"it stops at {most:,}: shorten it, or change its method"
-            text = f"{self._task.scene.name}: {done}; {advice}"
+            text = f"{self._task.scene.name}: {progress_text}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     def _interpolate(self, step: Step, x: list[float]) -> list[list[float]] | None:

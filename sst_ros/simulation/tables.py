@@ -56,10 +56,10 @@ def write_table(
                 pyarrow.field(name, array.type, metadata=about[name])
                 for name, array in zip(columns, arrays, strict=True)
             ]
-            whole = pyarrow.Table.from_arrays(
+            table = pyarrow.Table.from_arrays(
                 arrays, schema=pyarrow.schema(fields, texts)
             )
-            parquet.write_table(whole, own, write_page_checksum=True)
+            parquet.write_table(table, own, write_page_checksum=True)
 
 
 def load_table(
@@ -82,23 +82,23 @@ def load_table(
         if zipped:
             with np.load(path, allow_pickle=False) as source:
                 numbers = {name: source[name] for name in columns}
-                found = {name: str(source[name]) for name in (*texts, _CHECKSUM)}
+                stored_texts = {name: str(source[name]) for name in (*texts, _CHECKSUM)}
         else:
             parquet = require("pyarrow.parquet")
             with parquet.ParquetFile(path, page_checksum_verification=True) as source:
                 table = source.read()
             numbers = {name: table[name].to_numpy() for name in columns}
             raw = table.schema.metadata or {}
-            found = {key.decode(): text.decode() for key, text in raw.items()}
-        asked = {name: found[name] for name in texts}
+            stored_texts = {key.decode(): text.decode() for key, text in raw.items()}
+        requested_texts = {name: stored_texts[name] for name in texts}
     except (KeyError, MissingDependency):
         raise
     except Exception as error:  # pyarrow and zipfile raise anything on bad bytes
         raise ValueError(" ".join(str(error).split())) from None
-    checksum = compute_checksum(asked, numbers)
-    if found.get(_CHECKSUM, checksum) != checksum:
+    checksum = compute_checksum(requested_texts, numbers)
+    if stored_texts.get(_CHECKSUM, checksum) != checksum:
         raise ValueError("its checksum is another")
-    return numbers, asked
+    return numbers, requested_texts
 
 
 def compute_checksum(

@@ -65,7 +65,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-_KEY, _FORMAT = "sst_ros", 1
+_KEY = "sst_ros"
+"""Of the text in a file that holds what is no column."""
+_FORMAT = 1
+"""Number of the form of that text, for a later one to be refused here."""
 _ACCURACY = 1e-13
 """Error of a step between samples; gaps are short, so that steps do not add up."""
 
@@ -146,8 +149,8 @@ class RunRecord:
 
     def __post_init__(self) -> None:
         is_known = type(self.status) is int and self.status in _STATUSES
-        allowed = f"must be one of {_STATUSES}"
-        refuse_unless("trajectory", ("status", self.status, is_known, allowed))
+        requirement = f"must be one of {_STATUSES}"
+        refuse_unless("trajectory", ("status", self.status, is_known, requirement))
         if self.law is not None:
             object.__setattr__(self, "law", profile_of(self.law))
 
@@ -178,8 +181,8 @@ def read_figures(document: dict[str, Any]) -> dict[str, Any]:
     """
     figures = {name: document[name] for name in FIGURES if name in document}
     for name, value in figures.items():
-        kinds = (str,) if name in _TEXTS else (int, float)
-        if type(value) not in kinds:
+        types = (str,) if name in _TEXTS else (int, float)
+        if type(value) not in types:
             raise TypeError(f"{name} = {value!r}")
     return figures
 
@@ -190,10 +193,10 @@ def record_of_pickle(values: dict[str, Any]) -> RunRecord:
     There all that is known of the run stood among the arrays.
     """
     names = {field.name for field in fields(RunRecord)}
-    known = {name: value for name, value in values.items() if name in names}
-    known["energy_residual"] = values["_residual"]
-    known["parameters"] = values["_parameters"]
-    return RunRecord(**known)
+    record_fields = {name: value for name, value in values.items() if name in names}
+    record_fields["energy_residual"] = values["_residual"]
+    record_fields["parameters"] = values["_parameters"]
+    return RunRecord(**record_fields)
 
 
 def check_error(
@@ -272,8 +275,8 @@ class Trajectory(MotionTable):
         for name, size in sizes.items():
             shape = vars(self)[name].shape
             required = (self.t.size, size)
-            allowed = f"must have the shape {required}"
-            checks.append((name.strip("_"), shape, shape == required, allowed))
+            requirement = f"must have the shape {required}"
+            checks.append((name.strip("_"), shape, shape == required, requirement))
         refuse_unless("trajectory", *checks)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -336,8 +339,8 @@ class Trajectory(MotionTable):
     def _joints(self) -> Array:
         """Angles and rates of the joints, shape (n, 18)."""
         with np.errstate(all="ignore"):
-            found = kernel.joints(self._dynamics.model, self._columns)
-        columns = [np.broadcast_to(x, self.t.shape) for row in found for x in row]
+            joints = kernel.joints(self._dynamics.model, self._columns)
+        columns = [np.broadcast_to(x, self.t.shape) for row in joints for x in row]
         return freeze(np.stack(columns, axis=1))
 
     def _joint(self, name: str) -> Array:
@@ -351,12 +354,13 @@ class Trajectory(MotionTable):
         They are those under `torque` and the scene's loads. A moment from a topic is no
         part of them.
         """
-        model, y = self._dynamics.model._replace(time_constant=None), self._columns
+        model = self._dynamics.model._replace(time_constant=None)
+        y = self._columns
         with np.errstate(all="ignore"):
             slope = kernel.derivative(model, y, triple(self.torque.T))
-            found = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
+            accelerations = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
         return freeze(
-            np.stack([np.broadcast_to(x, self.t.shape) for x in found], axis=1)
+            np.stack([np.broadcast_to(x, self.t.shape) for x in accelerations], axis=1)
         )
 
     @cached_property
@@ -366,10 +370,10 @@ class Trajectory(MotionTable):
         They are those under `torque` and the scene's loads. A moment from a topic is no
         part of them.
         """
-        found = reactions_of(
+        reactions = reactions_of(
             self.scene, self.t, self.quaternion, self.body_rate, self.torque
         )
-        return replace(found, gaps=self.gaps)
+        return replace(reactions, gaps=self.gaps)
 
     @cached_property
     def euler_zyz(self) -> Array:
@@ -380,7 +384,8 @@ class Trajectory(MotionTable):
     def energy(self) -> Array:
         """Kinetic and potential energy [J], shape (n,)."""
         with np.errstate(all="ignore"):
-            model, columns = self._dynamics.model, self._columns
+            model = self._dynamics.model
+            columns = self._columns
             total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(
                 model, columns
             )
@@ -404,7 +409,8 @@ class Trajectory(MotionTable):
 
         0 if exact.
         """
-        rotation, geometry = rotation_matrix(self.quaternion), Geometry.of(self.scene)
+        rotation = rotation_matrix(self.quaternion)
+        geometry = Geometry.of(self.scene)
         return float(
             np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0)
         )
@@ -446,19 +452,21 @@ class Trajectory(MotionTable):
         times = np.atleast_1d(read_numbers("at", "t", t, seconds=True))
         inside = (times >= self.t[0]) & (times <= self.t[-1])
         fits = times.ndim == 1 and times.size > 0 and bool(np.all(inside))
-        allowed = f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
-        refuse_unless("at", ("t", t, fits, allowed))
-        known = not isinstance(self.law, LostTorque) or bool(
+        requirement = (
+            f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
+        )
+        refuse_unless("at", ("t", t, fits, requirement))
+        can_propagate = not isinstance(self.law, LostTorque) or bool(
             np.all(np.isin(times, self.t))
         )
-        allowed = (
+        requirement = (
             "must be times of samples: the function of the torques is not in the file"
         )
-        refuse_unless("at", ("t", t, known, allowed))
+        refuse_unless("at", ("t", t, can_propagate, requirement))
         for begin, end in self.gaps.tolist():
             outside = not np.any((times > begin) & (times < end))
-            allowed = f"nothing is known of the motion from {begin:g} to {end:g} s"
-            refuse_unless("at", ("t", t, outside, allowed))
+            requirement = f"nothing is known of the motion from {begin:g} to {end:g} s"
+            refuse_unless("at", ("t", t, outside, requirement))
         states = _propagate(self, times)
         return Trajectory(
             self.scene,
@@ -523,7 +531,8 @@ class Trajectory(MotionTable):
             MissingDependency: pyarrow (.parquet) or pandas (.csv) is not installed.
 
         """
-        path, ends = Path(path), f"must end in {' or '.join(SUFFIXES)}"
+        path = Path(path)
+        ends = f"must end in {' or '.join(SUFFIXES)}"
         free = overwrite or not os.path.exists(path)  # noqa: PTH110  # Path's raises on long names
         refuse_unless(
             "save",
@@ -559,7 +568,7 @@ class Trajectory(MotionTable):
             MissingDependency: pyarrow (.parquet) is not installed.
 
         """
-        allowed = (
+        requirement = (
             "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
         )
         try:
@@ -567,13 +576,14 @@ class Trajectory(MotionTable):
             about = json.loads(texts[_KEY])
         except (KeyError, ValueError, RecursionError) as error:
             reason = "" if isinstance(error, KeyError) else f" ({error})"
-            raise refusal("load", "path", str(path), allowed + reason) from None
+            raise refusal("load", "path", str(path), requirement + reason) from None
         form = about.get("format") if isinstance(about, dict) else None
         refuse_unless("load", ("format", form, form == _FORMAT, f"must be {_FORMAT}"))
         _check_columns(path, columns)
         arrays = {
             name: np.stack(
-                [columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]], axis=1
+                [columns[f"{name}_{component}"] for component in DIMENSIONS[dimension]],
+                axis=1,
             )
             for name, (_, dimension) in QUANTITIES.items()
         }
@@ -591,7 +601,7 @@ class Trajectory(MotionTable):
             )
         except (TypeError, ValueError, LookupError, AttributeError) as error:
             reason = f" (its metadata: {type(error).__name__}: {error})"
-            raise refusal("load", "path", str(path), allowed + reason) from None
+            raise refusal("load", "path", str(path), requirement + reason) from None
         lengths = np.linalg.norm(motion.quaternion, axis=1)
         off = float(np.abs(lengths - 1.0).max(initial=0.0))
         refuse_unless(
@@ -693,23 +703,24 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
             return states
         limit = trajectory.scene.torque_limit or np.inf
         return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
-    t, size = trajectory.t, len(trajectory._dynamics.state)
+    t = trajectory.t
+    size = len(trajectory._dynamics.state)
     samples = np.hstack(
         [trajectory.quaternion, trajectory.body_rate, trajectory.torque]
     )
     before = np.searchsorted(t, times, side="right") - 1
-    found = samples[before]
+    propagated = samples[before]
     for k in np.unique(before[times > t[before]]):
         rows = np.flatnonzero((before == k) & (times > t[k]))
-        asked, places = np.unique(times[rows], return_inverse=True)
+        distinct_times, places = np.unique(times[rows], return_inverse=True)
         law = trajectory.law or profile_of(trajectory.torque[k + 1])
-        span = float(t[k]), float(asked[-1])
-        task = Task(trajectory.scene, law, span, asked, DOP853.name, _ACCURACY)
+        span = float(t[k]), float(distinct_times[-1])
+        task = Task(trajectory.scene, law, span, distinct_times, DOP853.name, _ACCURACY)
         budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
         motion = SteppedMotion(task, samples[k, :size], budget, limits=False).run()
         if motion.status:
             raise Diverged(motion.message, motion.time, motion.state())
         table = motion.samples.table()
         states = np.hstack([table.quaternion, table.body_rate, table.torque])
-        found[rows] = states[places]
-    return found
+        propagated[rows] = states[places]
+    return propagated

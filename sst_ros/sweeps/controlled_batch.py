@@ -147,13 +147,13 @@ class ControlledBlock(Block):
         if len(self._uniform):
             fill(self._starts, self._feedback.starts[None, columns_of_block])
 
-    def store(self, part: slice, *columns: NDArray[Any]) -> None:
+    def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
         """Put states, errors, torques and memory back."""
-        super().store(part, *columns)
+        super().store(columns_of_block, *columns)
         given, memory = columns[1], self._feedback.memory
-        number = len(columns[2][part])
-        given[:3, part] = self.given[:3, :number]
-        memory[:, part] = self._memory[:, :number]
+        number = len(columns[2][columns_of_block])
+        given[:3, columns_of_block] = self.given[:3, :number]
+        memory[:, columns_of_block] = self._memory[:, :number]
 
     def prepare_step(self, number: int) -> None:
         """Give new torques where a step begins at a sample."""

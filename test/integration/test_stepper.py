@@ -55,7 +55,7 @@ def test_a_stiff_second_takes_few_steps_whatever_the_stiffness(coefficient, pair
     simulation.step(REST, 1_000_000_000)
     assert simulation.method == "rodas5p"
     fastest = np.abs(
-        simulation._stepper.ode.eigenvalues(0.0, simulation._now.point.y, REST)
+        simulation._stepper.ode.eigenvalues(0.0, simulation._current.point.y, REST)
     ).max()
     explicit = fastest / 3.3  # DOPRI5 is stable on the negative axis up to about 3.3
     assert explicit > 0.6 * coefficient
