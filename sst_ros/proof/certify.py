@@ -13,7 +13,7 @@ from __future__ import annotations
 import copy
 import math
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -42,7 +42,13 @@ from sst_ros.errors import (
     require,
 )
 from sst_ros.mechanism import generic_math as gm
-from sst_ros.mechanism.generic_math import cross3, dot3, quaternion_product, triple
+from sst_ros.mechanism.generic_math import (
+    Quadruple,
+    cross3,
+    dot3,
+    quaternion_product,
+    triple,
+)
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.progress import Bar
 from sst_ros.proof import enclosure
@@ -59,7 +65,7 @@ from sst_ros.proof.balls import (
 )
 from sst_ros.proof.closed_loop import CertifiedControl, SampledLoop, TrackingRow
 from sst_ros.proof.enclosure import Advance, Function, ProvenSteps, Refused, Region
-from sst_ros.proof.root import krawczyk
+from sst_ros.proof.root import Root, krawczyk
 from sst_ros.proof.scene_balls import (
     NumberReading,
     Parts,
@@ -115,15 +121,17 @@ class BallEquations:
         ranges: Mapping[Place, Any],
         control: CertifiedControl | None = None,
     ) -> None:
-        self.scene, self._profile = scene, profile
+        self.scene = scene
+        self._profile = profile
         self.state = Dynamics.of(scene).state
         self.balls = SceneBalls(scene, profile, ranges)
         self.loop: SampledLoop | None = None
-        self._held: tuple[str, ...] = ()  # numbers that a controller changes at ticks
+        # numbers that a controller changes at ticks
+        self._tick_inputs: tuple[str, ...] = ()
         if control is not None:
             self.loop = SampledLoop(control, self.balls, self.state)
-            self._held = (*TORQUE_SYMBOLS, *self.loop.memory)
-        self.inputs = (*self.state, *self._held, *self.balls.inputs)
+            self._tick_inputs = (*TORQUE_SYMBOLS, *self.loop.memory)
+        self.inputs = (*self.state, *self._tick_inputs, *self.balls.inputs)
 
     def start(self) -> Region:
         """Enclose the start by Krawczyk's test.
@@ -135,92 +143,108 @@ class BallEquations:
         that are ranges.
         """
         x, y, z, w, *rate = start_of(self.scene)[:7]
-
-        def equations(parts: Parts, *inputs: Any) -> list[Any]:
-            turn, body_rate, angles, rates = (
-                inputs[k : k + 3] for k in range(0, 12, 3)
-            )
-            q = quaternion_product((x, y, z, w), (turn[0], turn[1], turn[2], 1.0))
-            legs = list(kernel.leg_motions(parts.model, (*q, *body_rate)))
-            gaps = []
-            for leg, angle in zip(legs, angles, strict=True):
-                sine, cosine = kernel.direction_of(leg, 0)
-                gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
-            return gaps + [
-                leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)
-            ]
-
-        unknown, initial = (
-            (*TURN_SYMBOLS, *RATE_SYMBOLS),
-            (*GAMMA_SYMBOLS, *ANGLE_RATES),
-        )
+        unknown = (*TURN_SYMBOLS, *RATE_SYMBOLS)
+        initial = (*GAMMA_SYMBOLS, *ANGLE_RATES)
         by = (*unknown, *initial, *self.balls.inputs)
+        equations = _start_equations((x, y, z, w))
         run = self.balls.compile(equations, (*unknown, *initial), by)
         initial_numbers = [
             *self.balls.initial("gamma"),
             *self.balls.initial("gamma_dot"),
         ]
-        given = [x.ball if isinstance(x, NumberReading) else x for x in initial_numbers]
-        given += self.balls.varied_balls
-        root = krawczyk(run, [0.0, 0.0, 0.0, *rate], given, AT_START)
+        parameters = [
+            x.ball if isinstance(x, NumberReading) else x for x in initial_numbers
+        ]
+        parameters += self.balls.varied_balls
+        root = krawczyk(run, [0.0, 0.0, 0.0, *rate], parameters, AT_START)
         size = len(self.state)
         n = size + len(self.balls.inputs)
-        # Columns of the set: a range of an initial number has one, in place of a number
-        # of the state; how numbers are read, and all other ranges, have that of their
-        # own input.
-        by_column = [[arb(0)] * n for _ in unknown]
-        off = [arb(0)] * len(unknown)
-        radii = [arb(0)] * n
-        for j, ball in enumerate(given):
-            place = j if j < len(initial) else size + j - len(initial)
-            factor, radius = arb(1), ball.rad()
-            if j < len(initial) and isinstance(
-                reading := initial_numbers[j], NumberReading
-            ):
-                place, factor, radius = n - 1, reading.half, arb(0)
-                missing = abs(reading.middle - ball.mid())
-                for i in range(len(unknown)):
-                    off[i] += abs(root.slopes[i, j]) * missing
-            for i in range(len(unknown)):
-                by_column[i][place] += root.slopes[i, j] * factor
-            radii[place] = arb.max(radii[place], radius)
-        rest = [x + more for x, more in zip(root.rest, off, strict=True)]
+        by_column, radii, reading_errors = self._columns_of_start(
+            root, initial_numbers, parameters
+        )
+        remainder = [
+            x + reading_error
+            for x, reading_error in zip(root.remainder, reading_errors, strict=True)
+        ]
         # q is linear in the turn.
         units = [quaternion_product((x, y, z, w), unit) for unit in _UNIT_QUATERNIONS]
         slopes = []
         errors = [arb(0)] * n
         for i in range(4):
-            parts = [arb(units[k][i]) for k in range(3)]
+            quaternion_slopes = [arb(units[k][i]) for k in range(3)]
             rows = zip(*by_column[:3], strict=True)
-            slopes.append([sum(map(operator.mul, parts, row), arb(0)) for row in rows])
+            slopes.append(
+                [sum(map(operator.mul, quaternion_slopes, row), arb(0)) for row in rows]
+            )
             errors[i] = sum(
-                (abs(a) * b for a, b in zip(parts, rest[:3], strict=True)), arb(0)
+                (
+                    abs(a) * b
+                    for a, b in zip(quaternion_slopes, remainder[:3], strict=True)
+                ),
+                arb(0),
             )
         slopes += by_column[3:]
-        errors[4:7] = rest[3:]
+        errors[4:7] = remainder[3:]
         for place in range(len(slopes), n):
             row = [arb(0)] * n
             row[place] = arb(int(place >= size))
             slopes.append(row)
         turned = quaternion_product((x, y, z, w), (*root.middle[:3], arb(1)))
         lagged = [arb(0)] * (size - len(MOTION))
-        varied = [arb(x.mid()) for x in given[len(initial) :]]
+        varied = [arb(x.mid()) for x in parameters[len(initial) :]]
         centre = [*turned, *root.middle[3:], *lagged, *varied]
         region = Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
         return region if self.loop is None else self.loop.begin(region)
 
-    def _unlimited(self, parts: Parts, time: Any, command: Sequence[Any]) -> list[Any]:
+    def _columns_of_start(
+        self, root: Root, initial_numbers: Sequence[Any], parameters: Sequence[Any]
+    ) -> tuple[list[list[Any]], list[Any], list[Any]]:
+        """Return how the root depends on the numbers of the set, column by column.
+
+        The radii of the columns follow, then bounds of what the readings leave out.
+        """
+        size = len(self.state)
+        n = size + len(self.balls.inputs)
+        # Columns of the set: a range of an initial number has one, in place of a number
+        # of the state; how numbers are read, and all other ranges, have that of their
+        # own input.
+        by_column = [[arb(0)] * n for _ in root.middle]
+        reading_errors = [arb(0)] * len(root.middle)
+        radii = [arb(0)] * n
+        for j, ball in enumerate(parameters):
+            place = j if j < len(initial_numbers) else size + j - len(initial_numbers)
+            factor = arb(1)
+            radius = ball.rad()
+            if j < len(initial_numbers) and isinstance(
+                reading := initial_numbers[j], NumberReading
+            ):
+                place = n - 1
+                factor = reading.half
+                radius = arb(0)
+                missing = abs(reading.middle - ball.mid())
+                for i in range(len(root.middle)):
+                    reading_errors[i] += abs(root.slopes[i, j]) * missing
+            for i in range(len(root.middle)):
+                by_column[i][place] += root.slopes[i, j] * factor
+            radii[place] = arb.max(radii[place], radius)
+        return by_column, radii, reading_errors
+
+    def _unlimited(
+        self, traced_scene: Parts, time: Any, command: Sequence[Any]
+    ) -> list[Any]:
         """Return the torques that are commanded: those given, or sines of the time."""
         if not isinstance(self._profile, SineTorque):
             return list(command)
-        sine = parts.scene.torque
+        sine = traced_scene.scene.torque
         rows = zip(sine.amplitude, sine.frequency, sine.phase, strict=True)
         return [a * gm.sin(f * time + phase) if a else 0.0 for a, f, phase in rows]
 
-    def _acting(self, parts: Parts, time: Any, command: Sequence[Any]) -> list[Any]:
+    def _acting(
+        self, traced_scene: Parts, time: Any, command: Sequence[Any]
+    ) -> list[Any]:
         """Return the torques that act: those that are commanded, clamped."""
-        torques = self._unlimited(parts, time, command)
-        limit = getattr(parts.scene.actuators, "torque_limit", None)
+        torques = self._unlimited(traced_scene, time, command)
+        limit = getattr(traced_scene.scene.actuators, "torque_limit", None)
         if limit is None:
             return torques
         return [
@@ -235,12 +259,16 @@ class BallEquations:
         """
         size = len(self.state)
 
-        def derivative(parts: Parts, time: Any, *given: Any) -> Any:
-            torque = self._acting(parts, time, given[size : size + 3])
-            slope = kernel.derivative(parts.model, given[:size], triple(torque))
+        def derivative(traced_scene: Parts, time: Any, *state_and_commands: Any) -> Any:
+            torque = self._acting(
+                traced_scene, time, state_and_commands[size : size + 3]
+            )
+            slope = kernel.derivative(
+                traced_scene.model, state_and_commands[:size], triple(torque)
+            )
             return (*slope, *[0.0] * (len(self.inputs) - size))
 
-        inputs = ("t", *self.state, *(self._held or TORQUE_SYMBOLS))
+        inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
         value = self.balls.compile(derivative, inputs)
         return value, self.balls.compile(derivative, inputs, self.inputs)
 
@@ -267,13 +295,16 @@ class BallEquations:
         if self.loop is not None:
             return function
         size = len(self.state)
-        piece: TorqueProfile = ConstantTorque((0.0, 0.0, 0.0))
+        torque_piece: TorqueProfile = ConstantTorque((0.0, 0.0, 0.0))
         if self._profile is not None and not isinstance(self._profile, SineTorque):
-            piece = self._profile.piece(begin, end)
+            torque_piece = self._profile.piece(begin, end)
 
         def commanded(time: Any, *y: Any) -> Sequence[Any]:
-            held = piece.held
-            command = piece.at(time) if held is None else map(arb, held)
+            held_torque = torque_piece.held
+            if held_torque is None:
+                command = torque_piece.at(time)
+            else:
+                command = tuple(map(arb, held_torque))
             return function(time, *y[:size], *command, *y[size:])
 
         return commanded
@@ -285,8 +316,8 @@ class BallEquations:
         The derivatives are by quaternion, W and varied.
         """
 
-        def angles_and_rates(parts: Parts, *y: Any) -> list[Any]:
-            return [x for row in kernel.joints(parts.model, y) for x in row]
+        def angles_and_rates(traced_scene: Parts, *y: Any) -> list[Any]:
+            return [x for row in kernel.joints(traced_scene.model, y) for x in row]
 
         return self.balls.compile(
             angles_and_rates, MOTION, (*MOTION, *self.balls.inputs)
@@ -324,8 +355,8 @@ class BallEquations:
     def turn_names(self) -> list[str]:
         """Names of the joints with dry friction, where they turn back."""
         return [
-            f"{JOINT_QUANTITIES[kind]}_{leg} turns back under dry friction"
-            for kind in self._rubbing
+            f"{JOINT_QUANTITIES[joint_kind]}_{leg} turns back under dry friction"
+            for joint_kind in self._rubbing
             for leg in (1, 2, 3)
         ]
 
@@ -337,8 +368,8 @@ class BallEquations:
             return []
         laws = (friction.gamma, friction.mu, friction.beta)
         return [
-            kind
-            for kind, law in enumerate(laws)
+            joint_kind
+            for joint_kind, law in enumerate(laws)
             if law is not None and (law.coulomb or law.static)
         ]
 
@@ -353,13 +384,17 @@ class BallEquations:
     def _rubbing_rates(self) -> Function:
         """Compile the rates of the joints with dry friction [rad/s]."""
 
-        def rates(parts: Parts, time: Any, *given: Any) -> list[Any]:
-            legs = list(kernel.leg_motions(parts.model, given))
+        def rates(
+            traced_scene: Parts, time: Any, *state_and_commands: Any
+        ) -> list[Any]:
+            legs = list(kernel.leg_motions(traced_scene.model, state_and_commands))
             return [
-                kernel.joint_rate(leg, kind) for kind in self._rubbing for leg in legs
+                kernel.joint_rate(leg, joint_kind)
+                for joint_kind in self._rubbing
+                for leg in legs
             ]
 
-        inputs = ("t", *self.state, *(self._held or TORQUE_SYMBOLS))
+        inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
         return self.balls.compile(rates, inputs)
 
     @cached_property
@@ -368,31 +403,62 @@ class BallEquations:
 
         They are functions of time, state, commands and varied.
         """
-        size, elastic = len(self.state), self.scene.stroke.at_end == "elastic"
+        size = len(self.state)
+        is_elastic = self.scene.stroke.at_end == "elastic"
 
-        def distances(parts: Parts, time: Any, *given: Any) -> list[Any]:
-            legs = list(kernel.leg_motions(parts.model, given))
+        def distances(
+            traced_scene: Parts, time: Any, *state_and_commands: Any
+        ) -> list[Any]:
+            legs = list(kernel.leg_motions(traced_scene.model, state_and_commands))
             first, second, third = (leg.g for leg in legs)
             angles = [
-                kernel.joint_angle(leg, kind) for kind in range(3) for leg in legs
+                kernel.joint_angle(leg, joint_kind)
+                for joint_kind in range(3)
+                for leg in legs
             ]
-            ends = {0: parts.axes.arc, 2: [parts.axes.beta_max] * 3}
+            ends = {0: traced_scene.axes.arc, 2: [traced_scene.axes.beta_max] * 3}
             values = []
             for limit in self.stops:
-                kind, k = divmod(limit.joint, 3)
-                end = ends[kind][k] if limit.sign < 0.0 and kind in ends else limit.end
+                joint_kind, k = divmod(limit.joint, 3)
+                end = (
+                    ends[joint_kind][k]
+                    if limit.sign < 0.0 and joint_kind in ends
+                    else limit.end
+                )
                 values.append(limit.sign * (angles[limit.joint] - end))
             values.append(dot3(first, cross3(second, third)))
-            for k in range(3 if elastic else 0):
-                values += [angles[k], parts.axes.arc[k] - angles[k]]
-            most = getattr(parts.scene.actuators, "torque_limit", None)
-            if most is not None:
-                unlimited = self._unlimited(parts, time, given[size : size + 3])
-                values += [(most - x) * (most + x) for x in unlimited]
+            for k in range(3 if is_elastic else 0):
+                values += [angles[k], traced_scene.axes.arc[k] - angles[k]]
+            torque_limit = getattr(traced_scene.scene.actuators, "torque_limit", None)
+            if torque_limit is not None:
+                unlimited = self._unlimited(
+                    traced_scene, time, state_and_commands[size : size + 3]
+                )
+                values += [(torque_limit - x) * (torque_limit + x) for x in unlimited]
             return values
 
-        inputs = ("t", *self.state, *(self._held or TORQUE_SYMBOLS))
+        inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
         return self.balls.compile(distances, inputs)
+
+
+def _start_equations(orientation: Quadruple) -> Callable[..., list[Any]]:
+    """Return the equations of the start, whose unknowns are a turn and the body rate.
+
+    The first three are zero where the turn from the orientation puts the legs at the
+    angles of the actuators, the others where their rates agree.
+    """
+
+    def equations(traced_scene: Parts, *inputs: Any) -> list[Any]:
+        turn, body_rate, angles, rates = (inputs[k : k + 3] for k in range(0, 12, 3))
+        q = quaternion_product(orientation, (turn[0], turn[1], turn[2], 1.0))
+        legs = list(kernel.leg_motions(traced_scene.model, (*q, *body_rate)))
+        gaps = []
+        for leg, angle in zip(legs, angles, strict=True):
+            sine, cosine = kernel.direction_of(leg, 0)
+            gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
+        return gaps + [leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)]
+
+    return equations
 
 
 class Row(NamedTuple):
@@ -413,13 +479,16 @@ class Follower:
     """
 
     def __init__(self, equations: BallEquations, trajectory: Trajectory) -> None:
-        self._equations, self._trajectory = equations, trajectory
+        self._equations = equations
+        self._trajectory = trajectory
         self._left = trajectory.t.tolist()
         self.rows: list[Row] = []
         self.tracking: list[TrackingRow] = []
         names = [*equations.limit_names, *equations.turn_names]
         self.signs: dict[str, list[Span]] = {name: [] for name in names}
-        self.until, self.reason, self.steps = 0.0, "", 0
+        self.until = 0.0
+        self.reason = ""
+        self.steps = 0
 
     @property
     def is_whole(self) -> bool:
@@ -460,13 +529,13 @@ class Follower:
         bar: Bar,
     ) -> None:
         loop = self._equations.loop
-        here = self._equations.start()
+        region = self._equations.start()
         for begin, end in pairwise(breaks):
             if loop is not None:
-                here = self._sample(loop, here)
+                region = self._sample(loop, region)
             f, jacobian = self._equations.between(begin, end)
             limits = self._equations.limits_between(begin, end)
-            for step in ProvenSteps(f, jacobian, here, end, tolerance, order):
+            for step in ProvenSteps(f, jacobian, region, end, tolerance, order):
                 self._take(step, limits)
                 if self._equations.turn_names:
                     self._note_turns(step, begin, end)
@@ -475,28 +544,31 @@ class Follower:
                     return
                 if self.steps >= max_steps and step.end < breaks[-1]:
                     raise Refused(f"{max_steps} steps are not enough")
-            here = enclosure.region_at_end(step, boxed=loop is not None)
+            region = enclosure.region_at_end(step, boxed=loop is not None)
         if loop is not None:
-            self._sample(loop, here)
+            self._sample(loop, region)
 
-    def _sample(self, loop: SampledLoop, here: Region) -> Region:
+    def _sample(self, loop: SampledLoop, region: Region) -> Region:
         """Return the region behind a tick of the controller.
 
         Keep the tracking error.
         """
-        here, row = loop.sample(here)
+        region, row = loop.sample(region)
         self.tracking.append(row)
-        return here
+        return region
 
     def _take(self, step: Advance, limits: Function) -> None:
         """Take what a step proves, up to where the motion meets an end of the scene."""
-        self.steps, end = self.steps + 1, step.end
-        names, stops = self._equations.limit_names, self._equations.stop_names
+        self.steps += 1
+        end = step.end
+        names = self._equations.limit_names
+        stop_names = self._equations.stop_names
         for low, high, signs in _signs(step, limits, len(names), SPLITS):
             for name, sign in zip(names, signs, strict=True):
                 self.signs[name].append((low, high, sign))
-                if name in stops and sign <= 0 and low < end:
-                    self.reason, end = name, low
+                if name in stop_names and sign <= 0 and low < end:
+                    self.reason = name
+                    end = low
         self.until = end
         while self._left and self._left[0] <= end:
             self.rows.append(self._row(step, self._left.pop(0)))
@@ -516,14 +588,14 @@ class Follower:
         p, e = step.at(time)
         varied = len(self._equations.balls.inputs)
         # of the state, without a lag, and what is a range
-        known = [*range(len(MOTION)), *range(len(p) - varied, len(p))]
-        centre = [p[i] for i in known]
+        joint_inputs = [*range(len(MOTION)), *range(len(p) - varied, len(p))]
+        centre = [p[i] for i in joint_inputs]
         values = [*zip(p[4:7], e[4:7], strict=True)]
         try:
             joints = self._equations.joints(*centre)
-            slopes = self._equations.joints(*(arb(p[i], e[i]) for i in known))
+            slopes = self._equations.joints(*(arb(p[i], e[i]) for i in joint_inputs))
             by = [[arb(0)] * len(p) for _ in range(JOINT_COUNT)]
-            for place, i in enumerate(known):
+            for place, i in enumerate(joint_inputs):
                 for row in range(JOINT_COUNT):
                     by[row][i] = arb(slopes[JOINT_COUNT * (place + 1) + row])
             bounds = step.at(time, arb_mat(by))[1]
@@ -536,23 +608,28 @@ class Follower:
             (x, upper(abs(ball - x) + r))
             for x, (ball, r) in zip(floats, values, strict=True)
         ]
-        length, wrong = norm(p[:4]), norm(e[:4]) / norm(p[:4])
+        length = norm(p[:4])
+        relative_error = norm(e[:4]) / length
         quaternion = [float(x / length) for x in p[:4]]
-        other = self._trajectory.quaternion[len(self.rows)].tolist()
+        simulated = self._trajectory.quaternion[len(self.rows)].tolist()
         angles = [arb.pi(), arb.pi()]
-        if wrong < 1:
-            angles = [2 * wrong.asin() + _turn(p[:4], q) for q in (quaternion, other)]
+        if relative_error < 1:
+            angles = [
+                2 * relative_error.asin() + _turn(p[:4], q)
+                for q in (quaternion, simulated)
+            ]
         return Row(time, quaternion, upper(angles[0]), upper(angles[1]), pairs)
 
 
-def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
+def unite(proofs: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
     """Return the rows that hold for all motions of some proofs.
 
     The spans of all of them are returned, too.
     """
-    first, until = parts[0], min(part.until for part in parts)
+    first = proofs[0]
+    until = min(proof.until for proof in proofs)
     rows = []
-    for rows_at in zip(*(part.rows for part in parts), strict=False):
+    for rows_at in zip(*(proof.rows for proof in proofs), strict=False):
         if rows_at[0].time > until:
             break
         centre = rows_at[0].quaternion
@@ -568,19 +645,19 @@ def unite(parts: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
             values.append((float(ball), upper(abs(ball - float(ball)))))
         distance = max(row.distance for row in rows_at)
         rows.append(Row(rows_at[0].time, centre, max(angles), distance, values))
-    if len(parts) == 1:
+    if len(proofs) == 1:
         rows = first.rows
     spans = {
-        name: sorted(x for part in parts for x in part.signs[name])
+        name: sorted(x for proof in proofs for x in proof.signs[name])
         for name in first.signs
     }
     return rows, spans
 
 
-def track_columns(parts: Sequence[Follower], until: float) -> dict[str, Array]:
+def track_columns(proofs: Sequence[Follower], until: float) -> dict[str, Array]:
     """Return what holds for all parts at the ticks: middles and bounds by name."""
     table: dict[str, list[float]] = {}
-    for rows_at in zip(*(part.tracking for part in parts), strict=False):
+    for rows_at in zip(*(proof.tracking for proof in proofs), strict=False):
         if rows_at[0].time > until:
             break
         table.setdefault("t", []).append(rows_at[0].time)
@@ -631,20 +708,23 @@ class ProvenMotion(Explained):
     def __init__(
         self, parts: Sequence[Follower], bound: float, trajectory: Trajectory
     ) -> None:
-        self.scene, self.bound, self.trajectory = trajectory.scene, bound, trajectory
-        shortest = min(parts, key=lambda part: part.until)
-        failed = [part for part in parts if not part.is_whole]
-        self.until, self.reason = shortest.until, (failed or [shortest])[0].reason
-        self.steps = sum(part.steps for part in parts)
+        self.scene = trajectory.scene
+        self.bound = bound
+        self.trajectory = trajectory
+        shortest = min(parts, key=lambda proof: proof.until)
+        failed = [proof for proof in parts if not proof.is_whole]
+        self.until = shortest.until
+        self.reason = (failed or [shortest])[0].reason
+        self.steps = sum(proof.steps for proof in parts)
         self._is_whole = not failed
         rows, spans = unite(parts)
-        names = [*(f"body_rate_{part}" for part in "xyz")]
+        names = [*(f"body_rate_{axis}" for axis in "xyz")]
         names += [f"{joint}_{leg}" for joint in JOINT_QUANTITIES for leg in (1, 2, 3)]
         quaternion = np.array([row.quaternion for row in rows]).reshape(-1, 4)
         values = np.array([row.values for row in rows]).reshape(-1, len(names), 2)
         self.columns: dict[str, Array] = {"t": np.array([row.time for row in rows])}
-        for k, part in enumerate("xyzw"):
-            self.columns[f"quaternion_{part}"] = quaternion[:, k]
+        for k, axis in enumerate("xyzw"):
+            self.columns[f"quaternion_{axis}"] = quaternion[:, k]
         self.columns["angle"] = np.array([row.angle for row in rows])
         self.columns["distance"] = np.array([row.distance for row in rows])
         for k, name in enumerate(names):
@@ -654,8 +734,8 @@ class ProvenMotion(Explained):
         for numbers in (*self.columns.values(), *self.tracking.values()):
             numbers.flags.writeable = False
         self.limits: dict[str, list[tuple[float, float]]] = {}
-        for name, known in spans.items():
-            self.limits[name] = _unknown_spans(known, self.until)
+        for name, sign_spans in spans.items():
+            self.limits[name] = _unknown_spans(sign_spans, self.until)
 
     @property
     def tracking_error(self) -> float:
@@ -726,10 +806,12 @@ class ProvenMotion(Explained):
         return facts | {"steps": self.steps}
 
 
-def _unknown_spans(known: Sequence[Span], until: float) -> list[tuple[float, float]]:
+def _unknown_spans(
+    sign_spans: Sequence[Span], until: float
+) -> list[tuple[float, float]]:
     """Join the spans whose sign is not known, of those that begin by a time."""
     joined: list[tuple[float, float]] = []
-    for begin, end, sign in known:
+    for begin, end, sign in sign_spans:
         if sign != 0 or begin > until:
             continue
         if joined and begin <= joined[-1][1]:
@@ -756,31 +838,35 @@ def _signs(
 
     Numbers are > 0 (1), < 0 (-1), or unknown (0).
     """
-    begin, left = step.begin.time, splits
+    begin = step.begin.time
+    splits_left = splits
     todo = [(begin, step.end)]
     while todo:
         low, high = todo.pop()
-        span, left, signs = (arb(low) - begin, arb(high) - begin), left - 1, [0] * count
-        near = between(span[0] - span[1], span[1] - span[0]) / 2
+        splits_left -= 1
+        span = (arb(low) - begin, arb(high) - begin)
+        signs = [0] * count
+        time_offset = between(span[0] - span[1], span[1] - span[0]) / 2
         with suppress(ArithmeticError, ValueError):  # a division by what may be zero
             rows = step.enclose(run, LIMIT_ORDER, step.tube, span)
-            values = [arb_poly(row)(near) for row in rows]
+            values = [arb_poly(row)(time_offset) for row in rows]
             signs = [int(bool(x > 0)) - int(bool(x < 0)) for x in values]
-        if all(signs) or left < 0 or high - low < 1e-10 * (step.end - begin):
+        if all(signs) or splits_left < 0 or high - low < 1e-10 * (step.end - begin):
             yield low, high, signs
         else:
             todo += [(0.5 * (low + high), high), (low, 0.5 * (low + high))]
 
 
-def split_ranges(ranges: Mapping[Place, Any], parts: int) -> list[dict[Place, Any]]:
+def split_ranges(ranges: Mapping[Place, Any], box_count: int) -> list[dict[Place, Any]]:
     """Split a box of ranges by halves, the one of most its first width first."""
     boxes = [dict(ranges)]
-    while len(boxes) < parts:
+    while len(boxes) < box_count:
         box = boxes.pop(0)
         widest = max(
             box, key=lambda place: float(box[place].rad() / ranges[place].rad())
         )
-        middle, quarter = box[widest].mid(), box[widest].rad() / 2
+        middle = box[widest].mid()
+        quarter = box[widest].rad() / 2
         for centre in (middle - quarter, middle + quarter):
             boxes.append(
                 box | {widest: arb(centre.mid(), (quarter + centre.rad()).upper())}
@@ -802,10 +888,10 @@ class ProofTask(NamedTuple):
 
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
-        scene, profile = self.trajectory.scene, self.profile
+        scene = self.trajectory.scene
         tolerance = 1e-6 * self.bound
         for _ in range(PROOF_ATTEMPTS):
-            equations = BallEquations(scene, profile, ranges, self.control)
+            equations = BallEquations(scene, self.profile, ranges, self.control)
             follower = Follower(equations, self.trajectory)
             follower.follow(
                 self.breaks, tolerance, self.max_steps, Bar(label, self.progress)
@@ -817,6 +903,12 @@ class ProofTask(NamedTuple):
                 break
             tolerance *= 0.1 * self.bound / follower.largest
         return follower
+
+    def prove_boxes(self, ranges: Mapping[Place, Any]) -> list[Follower]:
+        """Prove the motion for each part of the box of ranges."""
+        wide = {place: x for place, x in ranges.items() if x.rad() > 0}
+        boxes = split_ranges(wide, self.split) if wide else [{}]
+        return [self.prove_part({**ranges, **box}) for box in boxes]
 
     def prove_part(self, ranges: Mapping[Place, Any]) -> Follower:
         """Prove the motion for all numbers of ranges.
@@ -852,9 +944,11 @@ class ProofTask(NamedTuple):
         """Return the places of ranges for which the scene alone is not enclosed."""
         places = []
         for place, ball in ranges.items():
-            others = _narrowed(ranges, 0.0)
+            exact_ranges = _narrowed(ranges, 0.0)
             try:
-                SceneBalls(self.trajectory.scene, self.profile, others | {place: ball})
+                SceneBalls(
+                    self.trajectory.scene, self.profile, exact_ranges | {place: ball}
+                )
             except (ArithmeticError, ValueError):
                 places.append(place)
         return places
@@ -869,9 +963,9 @@ class ProofTask(NamedTuple):
         share = write_down(0.5**halvings, SHARE_DIGITS)
         advice = f"{share} of their width would do"
         wide = sum(ball.rad() > 0 for ball in ranges.values())
-        parts = self.split * 2 ** (halvings * wide)
-        if parts <= MOST_BOX_PARTS:
-            advice = f"{advice}, or split={parts} or more"
+        needed_split = self.split * 2 ** (halvings * wide)
+        if needed_split <= MOST_BOX_PARTS:
+            advice = f"{advice}, or split={needed_split} or more"
         return advice
 
     def _needed_halvings(self, ranges: Mapping[Place, Any]) -> int | None:
@@ -969,9 +1063,9 @@ def certify(
         control = _read_control(torque, noise, options.get("control_period"))
         torque = copy.deepcopy(control.controller)
     trajectory = simulate(scene, torque, duration, **options)
-    given = trajectory.scene
+    simulated_scene = trajectory.scene
     profile = trajectory.law
-    end = given.duration if duration is None else duration
+    end = simulated_scene.duration if duration is None else duration
     is_known = profile is not None and profile.is_known_ahead
     refuse_unless(
         "certify",
@@ -993,7 +1087,7 @@ def certify(
         ("split", split, split == 1 or bool(ranges), "splits ranges: give some"),
     )
     assert profile is not None and end is not None
-    own_torque = profile == given.torque
+    own_torque = profile == simulated_scene.torque
     end = round(end * NANOSECONDS) / NANOSECONDS
     kinks = profile.kinks()
     if control is not None:
@@ -1002,7 +1096,7 @@ def certify(
     breaks = [0.0, *np.unique(kinks[(kinks > 0.0) & (kinks < end)]).tolist(), end]
     with precision():
         balls = range_balls(
-            WrittenDocument.of(given),
+            WrittenDocument.of(simulated_scene),
             ranges or {},
             own_torque=own_torque,
             origin="certify",
@@ -1010,17 +1104,14 @@ def certify(
         task = ProofTask(
             trajectory, profile, breaks, bound, max_steps, progress, control, split
         )
-        wide = {place: x for place, x in balls.items() if x.rad() > 0}
-        boxes = split_ranges(wide, split) if wide else [{}]
-        parts = [task.prove_part({**balls, **box}) for box in boxes]
-        return ProvenMotion(parts, bound, trajectory)
+        return ProvenMotion(task.prove_boxes(balls), bound, trajectory)
 
 
 def _read_control(
     controller: Controller, noise: tuple[float, float], period: float | None
 ) -> CertifiedControl:
     """Return a copy of a controller as it begins, and how it is sampled."""
-    allowed = "must be two half-widths >= 0, of angles [rad] and of rates [rad/s]"
+    requirement = "must be two half-widths >= 0, of angles [rad] and of rates [rad/s]"
     refuse_unless(
         "certify",
         (
@@ -1029,7 +1120,7 @@ def _read_control(
             period is not None,
             "must be given with a Controller [s]",
         ),
-        ("noise", noise, all(0.0 <= x < math.inf for x in noise), allowed),
+        ("noise", noise, all(0.0 <= x < math.inf for x in noise), requirement),
     )
     assert period is not None
     begun = copy.deepcopy(controller)

@@ -55,7 +55,7 @@ SMALL_TANGENT = 0.25  # largest square of the tangent of half an error on SO(3)
 LOST = "the orientation at the measured angles is not proven to be the only one near"
 FAR = "the error on SO(3) may exceed what the series of its logarithm is proven for"
 
-_GIVEN = {
+_EXACT_INPUTS = {
     "guess": 4,
     **REFERENCE_SIZES,
     "feedforward": 3,
@@ -63,7 +63,7 @@ _GIVEN = {
     "limit": 1,
     "rest": 1,
 }
-"""Sizes of what a tick is given as exact numbers: reference, its torques, limit."""
+"""Sizes of the exact numbers that a tick takes: reference, its torques, limit."""
 
 
 def name_parts(sizes: Mapping[str, int]) -> list[str]:
@@ -71,22 +71,22 @@ def name_parts(sizes: Mapping[str, int]) -> list[str]:
     return [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
 
 
-def turn_near_zero(quaternion: Quadruple, rest: Any) -> Triple:
+def turn_near_zero(quaternion: Quadruple, unit_ball: Any) -> Triple:
     """Return the rotation vector of a small turn.
 
     `law.rotation_vector` divides by 0 there. With t = |(x, y, z)| / w it is 2 atan(t) /
     t (x, y, z) / w. What the alternating series of atan(t) / t leaves out is less than
-    its next term, and so is its derivative: both are in those of `rest` t^(2
+    its next term, and so is its derivative: both are in those of `unit_ball` t^(2
     ATAN_TERMS), for a ball from -1 to 1.
     """
     x, y, z, w = quaternion
     tangent: Triple = (x / w, y / w, z / w)
-    square = sum(part * part for part in tangent)
-    total = rest
+    square = sum(component * component for component in tangent)
+    total = unit_ball
     for k in reversed(range(ATAN_TERMS)):
         coefficient = (-1.0) ** k / (2 * k + 1)
         # As a double it is off by half a unit in its last place at most.
-        doubt = 0.0 if k == 0 else rest * (HALF_ULP * coefficient)
+        doubt = 0.0 if k == 0 else unit_ball * (HALF_ULP * coefficient)
         total = total * square + coefficient + doubt
     return multiply(2.0 * total, tangent)
 
@@ -105,7 +105,7 @@ class _Response(NamedTuple):
     values: list[Any]
     by_region: list[list[Any]]  # a row for each value
     by_noise: list[list[Any]]
-    rest: list[Any]  # by what the observer leaves open, bounds
+    observer_bounds: list[Any]  # by what the observer leaves open
 
 
 class CertifiedControl(NamedTuple):
@@ -129,10 +129,12 @@ class SampledLoop:
     def __init__(
         self, control: CertifiedControl, balls: SceneBalls, state: Sequence[str]
     ) -> None:
-        controller, noise = control.controller, control.noise
-        self._controller, self._settings = controller, controller.settings
-        self._size, self._varied = len(state), len(balls.inputs)
-        self._noise = [arb(noise[k // 3]) for k in range(6)]
+        controller = control.controller
+        self._controller = controller
+        self._settings = controller.settings
+        self._size = len(state)
+        self._varied = len(balls.inputs)
+        self._noise = [arb(control.noise[k // 3]) for k in range(6)]
         self._integrates = bool(self._settings.integral_rate)
         self.memory = name_parts({"integral": 3 if self._integrates else 0})
         self._sizes = {
@@ -140,29 +142,29 @@ class SampledLoop:
             "integral": len(self.memory),
             "noise": 6,
             "turn": 3,
-            **_GIVEN,
+            **_EXACT_INPUTS,
         }
         moving = [*state, *self.memory, *name_parts({"noise": 6, "turn": 3})]
-        inputs = [*moving, *name_parts(_GIVEN)]
+        inputs = [*moving, *name_parts(_EXACT_INPUTS)]
         self._respond = balls.compile(self._law, inputs, (*moving, *balls.inputs))
         self._measure = balls.compile(_angles, state, (*state, *balls.inputs))
         start = controller.desire(0.0)[0]
-        self._known = start.quaternion, start.gamma
+        self._last_assembly = start.quaternion, start.gamma
         self._loops = self._compile_loops() if self._settings.observes else None
         self._limit = controller.law_with(_none, _none).limit
 
-    def _law(self, parts: Parts, *inputs: Any) -> list[Any]:
+    def _law(self, traced_scene: Parts, *inputs: Any) -> list[Any]:
         """Torques, new memory, and the true error, in symbols."""
         of = divide(self._sizes, inputs)
-        legs = list(kernel.leg_motions(parts.model, of["state"]))
+        legs = list(kernel.leg_motions(traced_scene.model, of["state"]))
         gamma = triple(kernel.joint_angle(leg, 0) for leg in legs)
         gamma_dot = triple(leg.gamma_dot for leg in legs)
         measured = add(gamma, of["noise"][:3]), add(gamma_dot, of["noise"][3:])
         observed = quaternion_product(of["guess"], (*of["turn"], 1.0))
         model = kernel.model_of(self._controller.model)
 
-        def torque(*at: Any) -> Any:
-            return kernel.actuator_torque(model, *at)[0]
+        def torque(*motion: Any) -> Any:
+            return kernel.actuator_torque(model, *motion)[0]
 
         def turn(quaternion: Quadruple) -> Triple:
             return turn_near_zero(quaternion, of["rest"][0])
@@ -191,21 +193,23 @@ class SampledLoop:
 
     def begin(self, start: Region) -> Region:
         """Return a region with torques and memory, which are zero, behind the state."""
-        count, size = 3 + len(self.memory), self._size
+        count = 3 + len(self.memory)
+        size = self._size
         places = [*range(size), *range(size + count, len(start.centre) + count)]
         self._first = start.c.ncols()
         n = len(start.centre) + count
         centre = [arb(0)] * n
         for place, number in zip(places, start.centre, strict=True):
             centre[place] = number
-        one = [[arb(int(i == j)) for j in range(n)] for i in range(n)]
-        axes, b = [row[:] for row in one], [arb(0)] * n
+        identity = [[arb(int(i == j)) for j in range(n)] for i in range(n)]
+        axes = [row[:] for row in identity]
+        b = [arb(0)] * n
         columns = [[arb(0)] * start.c.ncols() for _ in range(n)]
         rows = zip(places, start.c.tolist(), start.axes.tolist(), strict=True)
         for place, c_row, axes_row in rows:
             columns[place] = c_row
-            for other, x in zip(places, axes_row, strict=True):
-                axes[place][other] = x
+            for axis_place, x in zip(places, axes_row, strict=True):
+                axes[place][axis_place] = x
         for place, x in zip(places, entries(start.b), strict=True):
             b[place] = x
         return Region(
@@ -218,53 +222,82 @@ class SampledLoop:
             start.fixed + count,
         )
 
-    def sample(self, here: Region) -> tuple[Region, TrackingRow]:
+    def sample(self, region: Region) -> tuple[Region, TrackingRow]:
         """Return the region behind a tick, and what is proven of it."""
-        desired, now, held = self._controller.desire(here.time)
-        spread = entries(here.spread())
-        response = self._answer(here, spread, desired, now, held)
-        torques, count = range(3), 3 + len(self.memory)
-        bounds = self._bounds(here, response)
+        desired, feedforward, held_torque = self._controller.desire(region.time)
+        spread = entries(region.spread())
+        response = self._answer(region, spread, desired, feedforward, held_torque)
+        count = 3 + len(self.memory)
+        bounds = self._bounds(region, response)
         pairs = list(zip(response.values, bounds, strict=True))
-        row = TrackingRow(here.time, pairs[count:], [pairs[k] for k in torques])
-        return self._move(here, spread, response, count), row
+        row = TrackingRow(region.time, pairs[count:], pairs[:3])
+        return self._move(region, spread, response, count), row
 
     def _answer(
         self,
-        here: Region,
+        region: Region,
         spread: Sequence[Any],
         desired: Reference,
-        now: Sequence[float],
-        held: Sequence[float],
+        feedforward: Sequence[float],
+        held_torque: Sequence[float],
     ) -> _Response:
         """Enclose the law in a region."""
-        size, memory, varied = self._size, len(self.memory), self._varied
-        box = [arb(0, x.upper()) + c for c, x in zip(here.centre, spread, strict=True)]
+        size, varied = self._size, self._varied
+        memory = len(self.memory)
+        box = [
+            arb(0, x.upper()) + c for c, x in zip(region.centre, spread, strict=True)
+        ]
         noise = [arb(0, x) for x in self._noise]
         guess, turn, turn_box, by_gamma, turn_rest, gamma_slopes = self._observe(
-            here, spread, box, noise
+            region, spread, box, noise
         )
         numbers: dict[str, Sequence[float]] = {"guess": guess}
         numbers |= {name: getattr(desired, name) for name in REFERENCE_SIZES}
         if self._settings.space == "so3" and self._settings.mode == "computed_torque":
             numbers["quaternion"] = self._alike(guess, turn_box, desired.quaternion)
-        numbers |= {"feedforward": now, "held": held, "limit": (self._limit or 0.0,)}
-        given = [arb(x) for name in list(_GIVEN)[:-1] for x in numbers[name]]
-        given.append(between(-1, 1))
+        numbers |= {
+            "feedforward": feedforward,
+            "held": held_torque,
+            "limit": (self._limit or 0.0,),
+        }
+        exact_inputs = [
+            arb(x) for name in list(_EXACT_INPUTS)[:-1] for x in numbers[name]
+        ]
+        exact_inputs.append(between(-1, 1))
         record = SideRecord()
         memories = slice(size + 3, size + 3 + memory)
         tail = slice(len(box) - varied, len(box))
 
-        def run(at: Sequence[Any], off: Sequence[Any], turned: Sequence[Any]) -> Any:
-            state = (*at[:size], *at[memories], *off, *turned)
-            return [arb(x) for x in self._respond(*state, *given, *at[tail])]
+        def run(point: Sequence[Any], off: Sequence[Any], turned: Sequence[Any]) -> Any:
+            state = (*point[:size], *point[memories], *off, *turned)
+            return [arb(x) for x in self._respond(*state, *exact_inputs, *point[tail])]
 
         count = 6 + memory
         with record.within(replay=False):
             flat = run(box, noise, turn_box)
         with record.within(replay=True):
-            values = run(here.centre, [arb(0)] * 6, turn)[:count]
+            values = run(region.centre, [arb(0)] * 6, turn)[:count]
         blocks = [flat[k : k + count] for k in range(count, len(flat), count)]
+        return self._chain_slopes(values, blocks, by_gamma, turn_rest, gamma_slopes)
+
+    def _chain_slopes(
+        self,
+        values: list[Any],
+        blocks: Sequence[Sequence[Any]],
+        by_gamma: Any,
+        turn_rest: Sequence[Any],
+        gamma_slopes: Sequence[dict[int, Any]],
+    ) -> _Response:
+        """Return the slopes of the law by the region and by the noise.
+
+        The blocks have its derivatives by each input. Those by the turn are chained
+        with the slopes of the turn by the measured angles, and these with the slopes
+        of the angles by the region.
+        """
+        size, varied = self._size, self._varied
+        memory = len(self.memory)
+        width = size + 3 + memory + varied
+        count = len(values)
         by_state, by_memory = blocks[:size], blocks[size : size + memory]
         by_noise = blocks[size + memory : size + memory + 6]
         by_turn = blocks[size + memory + 6 : size + memory + 9]
@@ -276,15 +309,15 @@ class SampledLoop:
             ]
             for i in range(count)
         ]
-        rows, noise_rows, rest = [], [], []
+        rows, noise_rows, observer_bounds = [], [], []
         for i in range(count):
-            row = [arb(0)] * len(box)
+            row = [arb(0)] * width
             for j, block in enumerate(by_state):
                 row[j] = block[i]
             for j, block in enumerate(by_memory):
                 row[size + 3 + j] = block[i]
             for j, block in enumerate(by_varied):
-                row[len(box) - varied + j] = block[i]
+                row[width - varied + j] = block[i]
             for k in range(3):
                 for j, slope in gamma_slopes[k].items():
                     row[j] = row[j] + by_measured[i][k] * slope
@@ -294,19 +327,19 @@ class SampledLoop:
                 off[k] = off[k] + by_measured[i][k]
             noise_rows.append(off)
             left = (abs(by_turn[j][i]) * turn_rest[j] for j in range(3))
-            rest.append(sum(left, arb(0)).abs_upper())
-        return _Response(values, rows, noise_rows, rest)
+            observer_bounds.append(sum(left, arb(0)).abs_upper())
+        return _Response(values, rows, noise_rows, observer_bounds)
 
     def _observe(
         self,
-        here: Region,
+        region: Region,
         spread: Sequence[Any],
         box: Sequence[Any],
         noise: Sequence[Any],
     ) -> Any:
         """Enclose the orientation at the measured angles, as a turn from a quaternion.
 
-        It is the turn at the middle, its slopes by the measured angles, and a rest.
+        It is the turn at the middle, its slopes by the measured angles, and bounds.
         """
         if self._loops is None:
             zero = [arb(0)] * 3
@@ -315,7 +348,9 @@ class SampledLoop:
         size, varied = self._size, self._varied
         first = len(box) - varied
         places = [*range(size), *range(first, len(box))]
-        middle = [arb(x) for x in self._measure(*(here.centre[j] for j in places))[:3]]
+        middle = [
+            arb(x) for x in self._measure(*(region.centre[j] for j in places))[:3]
+        ]
         flat = [arb(x) for x in self._measure(*(box[j] for j in places))]
         slopes = [
             {j: flat[3 * (k + 1) + i] for k, j in enumerate(places)} for i in range(3)
@@ -325,8 +360,8 @@ class SampledLoop:
             moved = sum((s * arb(0, spread[j].upper()) for j, s in row.items()), arb(0))
             measured.append(x + moved + off)
         gamma = triple(float(x.mid()) for x in measured)
-        guess = self._controller.space.follow(*self._known, gamma)
-        self._known = guess, gamma
+        guess = self._controller.space.follow(*self._last_assembly, gamma)
+        self._last_assembly = guess, gamma
         exact_guess = [arb(x) for x in guess]
         loops = self._loops
 
@@ -339,8 +374,9 @@ class SampledLoop:
             x + moved
             for x, moved in zip(root.middle, entries(root.slopes * off), strict=True)
         ]
-        rest = [
-            arb(x).abs_upper() + t.rad() for x, t in zip(root.rest, turn, strict=True)
+        remainder = [
+            arb(x).abs_upper() + t.rad()
+            for x, t in zip(root.remainder, turn, strict=True)
         ]
         exact = [x.mid() for x in turn]
         widths = column(
@@ -352,9 +388,9 @@ class SampledLoop:
         reach = entries(magnitude(root.slopes) * widths)
         turn_box = [
             arb(0, (x + r).upper()) + t
-            for t, x, r in zip(exact, reach, rest, strict=True)
+            for t, x, r in zip(exact, reach, remainder, strict=True)
         ]
-        return guess, exact, turn_box, root.slopes, rest, slopes
+        return guess, exact, turn_box, root.slopes, remainder, slopes
 
     def _alike(
         self, guess: Sequence[float], turn: Sequence[Any], desired: Sequence[float]
@@ -366,7 +402,7 @@ class SampledLoop:
         x, y, z, w = quaternion_product(tuple(map(arb, guess)), (*turn, arb(1)))
         signed = desired
         if sum(a * float(b) for a, b in zip(desired, (x, y, z, w), strict=True)) < 0.0:
-            signed = [-part for part in desired]
+            signed = [-component for component in desired]
         d: Any = tuple(map(arb, signed))
         first, second, third, real = quaternion_product((-x, -y, -z, w), d)
         if (
@@ -376,39 +412,43 @@ class SampledLoop:
             raise Refused(FAR)
         return signed
 
-    def _bounds(self, here: Region, response: _Response) -> list[Any]:
+    def _bounds(self, region: Region, response: _Response) -> list[Any]:
         """Bound how far the values are from those at the middle; exact errors first."""
-        reach = entries(here.spread(arb_mat(response.by_region)))
+        reach = entries(region.spread(arb_mat(response.by_region)))
         noise = entries(magnitude(arb_mat(response.by_noise)) * column(self._noise))
-        parts = zip(reach, noise, response.rest, response.values, strict=True)
-        return [(x + y + z + v.rad()).upper() for x, y, z, v in parts]
+        contributions = zip(
+            reach, noise, response.observer_bounds, response.values, strict=True
+        )
+        return [(x + y + z + v.rad()).upper() for x, y, z, v in contributions]
 
     def _move(
-        self, here: Region, spread: Sequence[Any], response: _Response, count: int
+        self, region: Region, spread: Sequence[Any], response: _Response, count: int
     ) -> Region:
         """Return the region with new torques and memory."""
-        n, size = len(here.centre), self._size
+        n = len(region.centre)
+        size = self._size
         rows = [[arb(int(i == j)) for j in range(n)] for i in range(n)]
         noise_rows = [[arb(0)] * 6 for _ in range(n)]
-        centre, rest = list(here.centre), [arb(0)] * n
+        centre = list(region.centre)
+        remainder = [arb(0)] * n
         for k in range(count):
             place = size + k
             rows[place], noise_rows[place] = response.by_region[k], response.by_noise[k]
             centre[place] = response.values[k].mid()
-            rest[place] = response.rest[k] + response.values[k].rad()
+            remainder[place] = response.observer_bounds[k] + response.values[k].rad()
         slopes, noise = arb_mat(rows), arb_mat(noise_rows)
         middle, noise_middle = slopes.mid(), noise.mid()
         widths = column(self._noise)
         error = magnitude(slopes - middle) * column(spread)
-        error += magnitude(noise - noise_middle) * widths + column(rest)
-        generators = _Generators.of(here)
+        error += magnitude(noise - noise_middle) * widths + column(remainder)
+        generators = _Generators.of(region)
         moved = middle * generators.directions
         directions = moved.mid()
         error += magnitude(moved - directions) * generators.widths
         moved_generators = _Generators(directions, generators.widths)
         moved_generators = moved_generators.join(noise_middle, self._noise)
         moved_generators = moved_generators.join_box(entries(error))
-        return moved_generators.reduce(self._first).region(here, centre)
+        return moved_generators.reduce(self._first).region(region, centre)
 
 
 class _Generators(NamedTuple):
@@ -440,8 +480,8 @@ class _Generators(NamedTuple):
     def join_box(self, radii: Sequence[Any]) -> _Generators:
         """Add a box."""
         n = len(radii)
-        one = arb_mat([[arb(int(i == j)) for j in range(n)] for i in range(n)])
-        return self.join(one, [arb(x) for x in radii])
+        identity = arb_mat([[arb(int(i == j)) for j in range(n)] for i in range(n)])
+        return self.join(identity, [arb(x) for x in radii])
 
     def reduce(self, first: int) -> _Generators:
         """Put the smallest directions into a box where they are too many.
@@ -464,20 +504,20 @@ class _Generators(NamedTuple):
             _of_columns([columns[k] for k in fold]), column([bounds[k] for k in fold])
         )
         box = entries(magnitude(folded.directions) * folded.widths)
-        rest = _Generators(
+        kept_generators = _Generators(
             _of_columns([columns[k] for k in kept]), column([bounds[k] for k in kept])
         )
-        return rest.join_box(box)
+        return kept_generators.join_box(box)
 
-    def region(self, here: Region, centre: Sequence[Any]) -> Region:
+    def region(self, old_region: Region, centre: Sequence[Any]) -> Region:
         """Return a region of the set about another centre."""
         n = len(centre)
-        one = arb_mat(n, n, [0] * (n * n)) + 1
-        return here._replace(
+        identity = arb_mat(n, n, [0] * (n * n)) + 1
+        return old_region._replace(
             centre=list(centre),
             c=self.directions,
             a=self.widths,
-            axes=one,
+            axes=identity,
             b=column([0] * n),
         )
 
@@ -486,10 +526,11 @@ def _of_columns(columns: Sequence[Sequence[Any]]) -> Any:
     return arb_mat([list(row) for row in zip(*columns, strict=True)])
 
 
-def _angles(parts: Parts, *state: Any) -> list[Any]:
+def _angles(traced_scene: Parts, *state: Any) -> list[Any]:
     """Angles of the actuators of a plant, in symbols."""
     return [
-        kernel.joint_angle(leg, 0) for leg in kernel.leg_motions(parts.model, state)
+        kernel.joint_angle(leg, 0)
+        for leg in kernel.leg_motions(traced_scene.model, state)
     ]
 
 

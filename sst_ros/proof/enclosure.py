@@ -69,7 +69,8 @@ class Refused(ArithmeticError):
         self, reason: str, shorter: float = 0.5, wider: list[Any] | None = None
     ) -> None:
         super().__init__(reason)
-        self.shorter, self.wider = shorter, wider
+        self.shorter = shorter
+        self.wider = wider
 
 
 class KinkMet(Refused):
@@ -158,7 +159,8 @@ class _KinkWatch:
         """
         global _watch
         before, _watch = _watch, self
-        self._reach, self._next = reach, 0
+        self._reach = reach
+        self._next = 0
         if reach is None:
             self._middles.clear()
         try:
@@ -311,8 +313,8 @@ def _coefficients(x: Any, size: int) -> list[Any]:
         raise Refused(
             "a series is shorter than asked: another thread uses python-flint"
         )
-    known = x.coeffs()
-    return [*known, *[arb(0)] * size][:size]
+    coefficients = x.coeffs()
+    return [*coefficients, *[arb(0)] * size][:size]
 
 
 # Sets, and what a step proves.
@@ -341,13 +343,14 @@ class Region(NamedTuple):
     def box(cls, time: float, balls: Sequence[Any]) -> Region:
         """Return the region of all that lies in balls."""
         n = len(balls)
-        one, zero = arb_mat(n, n, [0] * (n * n)) + 1, column([0] * n)
+        identity = arb_mat(n, n, [0] * (n * n)) + 1
+        zero = column([0] * n)
         return cls(
             time,
             [x.mid() for x in balls],
-            one,
+            identity,
             column([x.rad() for x in balls]),
-            one,
+            identity,
             zero,
         )
 
@@ -358,18 +361,19 @@ class Region(NamedTuple):
         centre: Sequence[Any],
         c: Any,
         a: Sequence[Any],
-        rest: Sequence[Any],
+        errors: Sequence[Any],
         fixed: int,
     ) -> Region:
-        """Return the region of all centre + C a +- rest, whose numbers are balls."""
-        n, exact = len(centre), c.mid()
-        one = arb_mat(n, n, [0] * (n * n)) + 1
+        """Return the region of all centre + C a +- errors, whose numbers are balls."""
+        n = len(centre)
+        exact = c.mid()
+        identity = arb_mat(n, n, [0] * (n * n)) + 1
         widths = column([arb(x).upper() for x in a])
-        more = column([x.rad() for x in centre]) + column(
-            [arb(x).abs_upper() for x in rest]
+        error_bounds = column([x.rad() for x in centre]) + column(
+            [arb(x).abs_upper() for x in errors]
         )
-        b = magnitude(magnitude(c - exact) * widths + more)
-        return cls(time, [x.mid() for x in centre], exact, widths, one, b, fixed)
+        b = magnitude(magnitude(c - exact) * widths + error_bounds)
+        return cls(time, [x.mid() for x in centre], exact, widths, identity, b, fixed)
 
     def spread(self, by: Any = 1) -> Any:
         """Bound each number of by e."""
@@ -426,8 +430,8 @@ class Advance(NamedTuple):
         fixed = (x + e for x, e in zip(self.begin.centre, tube, strict=True))
         time = arb_series([arb(self.begin.time) + where, 1], size)
         series = (_series(row, size) for row in rows)
-        found = function(time, *series, *islice(fixed, count, None))
-        return [_coefficients(x, size) for x in found]
+        expansions = function(time, *series, *islice(fixed, count, None))
+        return [_coefficients(x, size) for x in expansions]
 
     def values(self, function: Function, where: Any, tube: Sequence[Any]) -> list[Any]:
         """Enclose the values of a function at s in `where`.
@@ -443,7 +447,7 @@ class Advance(NamedTuple):
         order: int,
         tube: Sequence[Any],
         span: tuple[Any, Any] | None = None,
-        parts: int = 1,
+        span_count: int = 1,
     ) -> list[list[Any]]:
         """Return coefficients of polynomials that enclose a function in a span.
 
@@ -454,18 +458,19 @@ class Advance(NamedTuple):
         begin, end = span or (arb(0), self.length)
         if order == 0:
             return [[x] for x in self.values(function, between(begin, end), tube)]
-        part = (end - begin) / parts
-        watch, reach = _KinkWatch(), ((end - begin) / 2).abs_upper()
+        span_length = (end - begin) / span_count
+        watch = _KinkWatch()
+        reach = ((end - begin) / 2).abs_upper()
         with watch.within():
-            found = self.expand(function, (begin + end) / 2, order, tube)
+            middle_coefficients = self.expand(function, (begin + end) / 2, order, tube)
         last = []
-        for k in range(parts):
+        for k in range(span_count):
             with watch.within(reach):
-                where = between(begin + k * part, begin + (k + 1) * part)
+                where = between(begin + k * span_length, begin + (k + 1) * span_length)
                 last.append(self.expand(function, where, order + 1, tube))
         return [
-            [*row, reduce(arb.union, (one[i][order] for one in last))]
-            for i, row in enumerate(found)
+            [*row, reduce(arb.union, (expansion[i][order] for expansion in last))]
+            for i, row in enumerate(middle_coefficients)
         ]
 
 
@@ -485,32 +490,37 @@ def shift(coefficients: Sequence[Any], by: Any) -> list[Any]:
 
 
 def approximate(
-    f: Function, jacobian: Function, at: Region, order: int
+    f: Function, jacobian: Function, region: Region, order: int
 ) -> list[list[Any]]:
     """Return the coefficients of p.
 
     A series f(t, p) gives the next coefficient of p, and nearly those that follow: what
     they add to it is linear, by the Jacobian on what was known.
     """
-    n, p, j = len(at.centre), [[x] for x in at.centre], list[Any]()
+    n = len(region.centre)
+    p = [[x] for x in region.centre]
+    j: list[Any] = []
 
     def run(function: Function, size: int) -> list[list[Any]]:
-        series = (arb_series(row, size) for row in p[: at.moving])
-        found = function(
-            arb_series([at.time, 1], size), *series, *at.centre[at.moving :]
+        series = (arb_series(row, size) for row in p[: region.moving])
+        expansions = function(
+            arb_series([region.time, 1], size), *series, *region.centre[region.moving :]
         )
-        return [_coefficients(x, size) for x in found]
+        return [_coefficients(x, size) for x in expansions]
 
-    while (known := len(p[0])) <= order:
-        if known == JACOBIAN_TERMS:
+    while (known_count := len(p[0])) <= order:
+        if known_count == JACOBIAN_TERMS:
             j = _matrices(run(jacobian, JACOBIAN_TERMS)[n:], n)
-        slopes, new = run(f, min(known + len(j), order)), list[Any]()
-        for k in range(known - 1, len(slopes[0])):
-            added = (j[k - i] * x for i, x in enumerate(new, known))
+        slopes = run(f, min(known_count + len(j), order))
+        new: list[Any] = []
+        for k in range(known_count - 1, len(slopes[0])):
+            added = (j[k - i] * x for i, x in enumerate(new, known_count))
             slope = sum(added, column([row[k] for row in slopes]))
             new.append((slope / (k + 1)).mid())
-        for row, more in zip(p, zip(*map(entries, new), strict=True), strict=True):
-            row += more
+        for row, new_coefficients in zip(
+            p, zip(*map(entries, new), strict=True), strict=True
+        ):
+            row += new_coefficients
     return p
 
 
@@ -528,7 +538,7 @@ def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
 
     `order` is that of p, or 0 for a bound of all of it, which holds across kinks.
     """
-    values = step.enclose(f, order, [arb(0)] * len(step.p), parts=2)
+    values = step.enclose(f, order, [arb(0)] * len(step.p), span_count=2)
     about_middle = arb_poly([step.half, 1])
     d = []
     for p, row in zip(step.p, values, strict=True):
@@ -563,16 +573,20 @@ def prove(
     step = _measure_defect(step, d, order, math.inf if across_kink else tolerance)
     j = _matrices(step.enclose(jacobian, j_order, step.tube)[n:], n)
     step = step._replace(v=_fundamental(j, step.half, v_order))
-    rest = _remainder(j, step)
-    whole = _values_of(j, step.half)
-    weights = _weights(whole)
-    source = entries(step.begin.spread(rest))  # of (J V - V') e(0)
+    remainder = _remainder(j, step)
+    jacobian_in_step = _values_of(j, step.half)
+    weights = _weights(jacobian_in_step)
+    source = entries(step.begin.spread(remainder))  # of (J V - V') e(0)
     integrals = [x * step.length for x in source]
     for k in range(defect_order + 1):
         for i, row in enumerate(d):
             integrals[i] += 2 * row[k] * step.half ** (k + 1) / (k + 1)
-    by_norm = _bound_by_norm(whole, weights, source, d[: step.begin.moving], step)
-    by_number = _bound_by_number(whole, integrals[: step.begin.moving], step.length)
+    by_norm = _bound_by_norm(
+        jacobian_in_step, weights, source, d[: step.begin.moving], step
+    )
+    by_number = _bound_by_number(
+        jacobian_in_step, integrals[: step.begin.moving], step.length
+    )
     w = [x.min(y).upper() for x, y in zip(by_norm, by_number, strict=True)]
     w += [arb(0)] * step.begin.fixed
     step = step._replace(w=column(w), weights=weights)
@@ -587,11 +601,13 @@ def _bound_by_norm(
     step: Advance,
 ) -> list[Any]:
     """Bound w by the logarithmic norm of J, that of what moves."""
-    every, size = range(len(d)), magnitude(jacobian)
-    growth, largest = arb(0), arb(0)  # of J; norm of (J V - V') e(0)
+    every = range(len(d))
+    size = magnitude(jacobian)
+    growth = arb(0)  # of J
+    largest = arb(0)  # norm of (J V - V') e(0)
     for i in every:
-        others = sum((size[i, k] * weights[k] for k in every if k != i), arb(0))
-        growth = growth.max((jacobian[i, i] + others / weights[i]).upper())
+        off_diagonal = sum((size[i, k] * weights[k] for k in every if k != i), arb(0))
+        growth = growth.max((jacobian[i, i] + off_diagonal / weights[i]).upper())
         largest = largest.max((source[i] / weights[i]).upper())
     most = largest * step.length  # integral of the norm of both: not less than its norm
     for k in range(len(d[0])):
@@ -609,7 +625,8 @@ def _bound_by_number(jacobian: Any, integrals: Sequence[Any], length: Any) -> li
     w_k, so that |w| <= exp(A h) (integral of |g|) where A bounds |J_ik|, and J_ii from
     0 on.
     """
-    every, size = range(len(integrals)), magnitude(jacobian)
+    every = range(len(integrals))
+    size = magnitude(jacobian)
     rates = [[size[i, k] * length for k in every] for i in every]
     for i in every:
         rates[i][i] = jacobian[i, i].upper().max(arb(0)) * length
@@ -651,23 +668,25 @@ def _fundamental(j: Sequence[Any], half: Any, order: int) -> list[Any]:
 
 def _remainder(j: Sequence[Any], step: Advance) -> Any:
     """Enclose J V - V' in the whole step."""
-    n, u = len(step.p), between(-step.half, step.half)
+    n = len(step.p)
+    u = between(-step.half, step.half)
     zero = arb_mat(n, n, [0] * (n * n))
-    about, degree = shift(step.v, step.half), len(step.v) - 1
-    rest = zero
+    about_middle = shift(step.v, step.half)
+    degree = len(step.v) - 1
+    remainder = zero
     for k in reversed(range(len(j) + degree)):
         some = range(max(0, k - degree), min(k, len(j) - 1) + 1)
-        term = sum((j[i] * about[k - i] for i in some), zero)
+        term = sum((j[i] * about_middle[k - i] for i in some), zero)
         if k < degree:
-            term = term - about[k + 1] * (k + 1)
-        rest = rest * u + term
-    return rest
+            term = term - about_middle[k + 1] * (k + 1)
+        remainder = remainder * u + term
+    return remainder
 
 
 def _values_of(j: Sequence[Any], half: Any) -> Any:
     """Enclose the values of a polynomial matrix in the whole step."""
     u = between(-half, half)
-    return reduce(lambda found, matrix: found * u + matrix, reversed(j))
+    return reduce(lambda partial_sum, matrix: partial_sum * u + matrix, reversed(j))
 
 
 def _check_tube(step: Advance, tolerance: float) -> Advance:
@@ -704,13 +723,14 @@ def _largest(bounds: Any, count: int) -> float:
 
 def _weights(jacobian: Any) -> list[Any]:
     """Return weights of a norm in which |J| is small: nearly its Perron vector."""
-    size, found = np.abs(_middles(jacobian)), np.ones(len(jacobian.tolist()))
+    size = np.abs(_middles(jacobian))
+    weights = np.ones(len(jacobian.tolist()))
     if not np.all(np.isfinite(size)):
         raise Refused(UNBOUNDED)
     for _ in range(20):
-        found = size @ found + 1e-3 * found
-        found = np.maximum(found / found.max(), 1e-9)
-    return [arb(x) for x in found.tolist()]
+        weights = size @ weights + 1e-3 * weights
+        weights = np.maximum(weights / weights.max(), 1e-9)
+    return [arb(x) for x in weights.tolist()]
 
 
 def region_at_end(step: Advance, *, boxed: bool = False) -> Region:
@@ -718,21 +738,24 @@ def region_at_end(step: Advance, *, boxed: bool = False) -> Region:
 
     What is `boxed` has the axes of its numbers.
     """
-    h, here = step.length, step.begin
-    flow, reached = step.flow(h), [p(h) for p in step.p]
-    moved, c = flow * here.axes, flow * here.c
+    h = step.length
+    start = step.begin
+    flow = step.flow(h)
+    reached = [p(h) for p in step.p]
+    moved = flow * start.axes
+    c = flow * start.c
     rounding = column([x.rad() for x in reached])
-    error = magnitude(c - c.mid()) * here.a + step.w + rounding
+    error = magnitude(c - c.mid()) * start.a + step.w + rounding
     centre = [x.mid() for x in reached]
     if boxed:
         n = len(centre)
         axes = arb_mat(n, n, [0] * (n * n)) + 1
-        b = magnitude(magnitude(moved) * here.b + error)
+        b = magnitude(magnitude(moved) * start.b + error)
     else:
-        axes = fit_axes(moved, here.b, [float(x) for x in step.weights])
+        axes = fit_axes(moved, start.b, [float(x) for x in step.weights])
         back = axes.inv()
-        b = magnitude(magnitude(back * moved) * here.b + magnitude(back) * error)
-    return Region(step.end, centre, c.mid(), here.a, axes, b, here.fixed)
+        b = magnitude(magnitude(back * moved) * start.b + magnitude(back) * error)
+    return Region(step.end, centre, c.mid(), start.a, axes, b, start.fixed)
 
 
 def _loss(step: Advance) -> float:
@@ -769,11 +792,11 @@ def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
     return arb_mat((scales * guide).tolist())
 
 
-def _tube(here: Region, room: float, tolerance: float) -> list[Any]:
+def _tube(region: Region, room: float, tolerance: float) -> list[Any]:
     """Return a tube with some room around a region; what never changes needs none."""
-    spread = entries(here.spread())
-    moving = [room * (x + tolerance) for x in spread[: here.moving]]
-    return [arb(0, x.upper()) for x in (*moving, *spread[here.moving :])]
+    spread = entries(region.spread())
+    moving = [room * (x + tolerance) for x in spread[: region.moving]]
+    return [arb(0, x.upper()) for x in (*moving, *spread[region.moving :])]
 
 
 class ProvenSteps:
@@ -782,7 +805,7 @@ class ProvenSteps:
     Args:
         f: derivative of the time and each number of the state, as series.
         jacobian: f, then its derivatives by each number of the state.
-        here: where the solution begins.
+        start: where the solution begins.
         end: time [s].
         tolerance: what the defect may add to an error in a step.
         order: degree of p.
@@ -793,51 +816,61 @@ class ProvenSteps:
         self,
         f: Function,
         jacobian: Function,
-        here: Region,
+        start: Region,
         end: float,
         tolerance: float,
         order: int,
     ) -> None:
-        self._f, self._jacobian, self._here, self._end = f, jacobian, here, end
-        self._tolerance, self._order = tolerance, order
-        self._span = end - here.time
-        self._room, self._factor = 3, 0.4  # of a tube; of a step by its longest
+        self._f, self._jacobian = f, jacobian
+        self._region = start
+        self._end = end
+        self._tolerance = tolerance
+        self._order = order
+        self._span = end - start.time
+        self._room = 3  # of a tube
+        self._factor = 0.4  # of a step by its longest
         # steps: the last, the longest next
-        self._usual, self._most = self._span, math.inf
+        self._usual = self._span
+        self._most = math.inf
         self._cruise = self._span  # last step before a kink was near
         self.kinks: list[tuple[float, float]] = []  # spans of time across kinks [s]
 
     def __iter__(self) -> Iterator[Advance]:
         """Yield the steps."""
-        while self._here.time < self._end:
+        while self._region.time < self._end:
             try:
                 step = self._smooth_step()
             except KinkMet as kink:
                 yield from self._cross_kink(kink)
                 continue
             yield step
-            self._here = region_at_end(step)
+            self._region = region_at_end(step)
 
     def _smooth_step(self) -> Advance:
         """Prove a step of Taylor series.
 
         KinkMet where one lies ahead within KINK_STEP.
         """
-        here, tolerance, order = self._here, self._tolerance, self._order
-        p = approximate(self._f, self._jacobian, here, order)
+        region = self._region
+        tolerance = self._tolerance
+        order = self._order
+        p = approximate(self._f, self._jacobian, region, order)
         sizes = [
             (k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)
         ]
         longest = min(
             [(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=self._usual
         )
-        wanted, tries = self._factor * longest, 0
+        wanted = self._factor * longest
+        tries = 0
         h = min(wanted, 4.0 * self._usual, self._most)
         is_free = h == wanted or self._most < math.inf  # no kink has made it short
-        tube = _tube(here, self._room, tolerance)
+        tube = _tube(region, self._room, tolerance)
         while True:
-            target = self._end if here.time + 1.01 * h > self._end else here.time + h
-            step = Advance(here, target, list(map(arb_poly, p)), tube)
+            target = region.time + h
+            if region.time + 1.01 * h > self._end:
+                target = self._end
+            step = Advance(region, target, list(map(arb_poly, p)), tube)
             try:
                 step = prove(self._f, self._jacobian, step, order, tolerance)
                 less_lossy = self._less_lossy(step)
@@ -845,26 +878,27 @@ class ProvenSteps:
                 step = less_lossy
                 break
             except KinkMet as kink:
-                tube, self._room = _tube(here, 3, tolerance), 3
-                h, is_free = self._clear_length(step._replace(tube=tube)), False
-                if h < KINK_STEP * self._span or here.time + h == here.time:
+                tube = _tube(region, 3, tolerance)
+                self._room = 3
+                h = self._clear_length(step._replace(tube=tube))
+                is_free = False
+                if h < KINK_STEP * self._span or region.time + h == region.time:
                     raise kink from None
             except (ArithmeticError, ValueError) as error:
                 why = error if isinstance(error, Refused) else Refused(UNBOUNDED)
                 if why.wider is not None and tries < 4:
-                    tube, tries = why.wider, tries + 1
+                    tube = why.wider
+                    tries += 1
                     self._room = min(2 * self._room, 100)
                     continue
-                h, tries, self._most, self._room = (
-                    why.shorter * (target - here.time),
-                    0,
-                    0.0,
-                    3,
-                )
-                tube = _tube(here, self._room, tolerance)
-                if h < LEAST_STEP * self._span or here.time + h == here.time:
+                h = why.shorter * (target - region.time)
+                tries = 0
+                self._most = 0.0
+                self._room = 3
+                tube = _tube(region, self._room, tolerance)
+                if h < LEAST_STEP * self._span or region.time + h == region.time:
                     raise why from None
-        self._plan(step.end - here.time, longest, step.defect, is_free=is_free)
+        self._plan(step.end - region.time, longest, step.defect, is_free=is_free)
         return step
 
     def _less_lossy(self, step: Advance) -> Advance:
@@ -904,7 +938,7 @@ class ProvenSteps:
         self, taken: float, longest: float, defect: float, *, is_free: bool
     ) -> None:
         """Choose what the next step is made from."""
-        if self._here.time + taken >= self._end:
+        if self._region.time + taken >= self._end:
             return
         self._usual = max(taken, 0.1 * self._usual)
         if self._most < math.inf:
@@ -919,7 +953,8 @@ class ProvenSteps:
 
     def _clear_length(self, step: Advance) -> float:
         """Return how long no kink is near, nearly, by halving a step that has one."""
-        low, high = 0.0, step.end - step.begin.time
+        low = 0.0
+        high = step.end - step.begin.time
         for _ in range(KINK_HALVINGS):
             middle = 0.5 * (low + high)
             try:
@@ -938,23 +973,25 @@ class ProvenSteps:
 
         Each is twice as long as the one before.
         """
-        begin, h = self._here.time, KINK_STEP * self._span
+        begin = self._region.time
+        h = KINK_STEP * self._span
         factor, cruise = self._factor, self._cruise
         for _ in range(KINK_STEPS):
             step = self._kink_step(h, kink)
             yield step
-            self._here = region_at_end(step)
+            self._region = region_at_end(step)
             taken = step.end - step.begin.time
             h = taken * (2.0 if _loss(step) < KINK_LOSS else 0.7)
             if step.end >= self._end:
                 break
-            self._usual, self._most = taken, math.inf
+            self._usual = taken
+            self._most = math.inf
             try:
                 ahead = self._smooth_step()
             except KinkMet:
                 continue
             yield ahead
-            self._here = region_at_end(ahead)
+            self._region = region_at_end(ahead)
             break
         else:
             raise Refused(f"{kink}, for longer than {KINK_STEPS} steps")
@@ -963,23 +1000,25 @@ class ProvenSteps:
 
     def _kink_step(self, longest: float, kink: KinkMet) -> Advance:
         """Prove a step across a kink by a straight line p."""
-        here, h = self._here, longest
+        region = self._region
+        h = longest
         for _ in range(KINK_HALVINGS):
-            target = min(self._end, here.time + h)
-            if target == here.time:
+            target = min(self._end, region.time + h)
+            if target == region.time:
                 break
-            half = (arb(target) - arb(here.time)) / 2
-            time, first = arb(here.time), self._f(arb(here.time), *here.centre)
+            half = (arb(target) - arb(region.time)) / 2
+            time = arb(region.time)
+            first = self._f(time, *region.centre)
             middle = [
                 x + half * arb(slope).mid()
-                for x, slope in zip(here.centre, first, strict=True)
+                for x, slope in zip(region.centre, first, strict=True)
             ]
             slopes = self._f(time + half, *middle)
             p = [
                 arb_poly([x, arb(s).mid()])
-                for x, s in zip(here.centre, slopes, strict=True)
+                for x, s in zip(region.centre, slopes, strict=True)
             ]
-            line = Advance(here, target, p, _tube(here, 3, self._tolerance))
+            line = Advance(region, target, p, _tube(region, 3, self._tolerance))
             for _ in range(4):
                 try:
                     return prove(

@@ -15,48 +15,50 @@ INFLATIONS = 6  # of the box in which the root is looked for
 class Root(NamedTuple):
     """Where the unknowns of equations are.
 
-    They are in middle + slopes (given - its middle) +- rest.
+    They are in middle + slopes (parameters - their middles) +- remainder.
     """
 
     middle: list[Any]
     slopes: Any
-    rest: list[Any]
+    remainder: list[Any]
 
 
 def krawczyk(
-    run: Function, near: Sequence[float], given: Sequence[Any], reason: str
+    run: Function, guess: Sequence[float], parameters: Sequence[Any], reason: str
 ) -> Root:
-    """Enclose the root of equations near some numbers, for all that is given as balls.
+    """Enclose the root of equations near a guess, for all parameters in balls.
 
-    `run` returns the values of the equations at unknowns and givens, then their
+    `run` returns the values of the equations at unknowns and parameters, then their
     derivatives by each. Raises Refused, with the reason, where the root is not proven
     to exist and to be the only one in a box.
     """
-    n, middles = len(near), [x.mid() for x in given]
-    off = column([x - middle for x, middle in zip(given, middles, strict=True)])
+    n = len(guess)
+    middles = [x.mid() for x in parameters]
+    off = column([x - middle for x, middle in zip(parameters, middles, strict=True)])
 
-    def at(unknown: Any, parameters: Sequence[Any]) -> tuple[Any, Any, Any]:
-        flat = [arb(x) for x in run(*entries(unknown), *parameters)]
+    def evaluate(unknown: Any, parameter_values: Sequence[Any]) -> tuple[Any, Any, Any]:
+        flat = [arb(x) for x in run(*entries(unknown), *parameter_values)]
         rows = [
-            [flat[n * (j + 1) + i] for j in range(n + len(given))] for i in range(n)
+            [flat[n * (j + 1) + i] for j in range(n + len(parameters))]
+            for i in range(n)
         ]
         by_unknown = arb_mat([row[:n] for row in rows])
         return column(flat[:n]), by_unknown, arb_mat([row[n:] for row in rows])
 
-    middle = column([arb(x) for x in near])
+    middle = column([arb(x) for x in guess])
     for _ in range(6):  # Newton
-        values, slopes, _ = at(middle, middles)
+        values, slopes, _ = evaluate(middle, middles)
         inverse = slopes.mid().inv().mid()
         middle = (middle - inverse * values).mid()
-    # for all that is given
-    values = at(middle, middles)[0] + at(middle, given)[2] * off
+    # for all parameters
+    values = evaluate(middle, middles)[0] + evaluate(middle, parameters)[2] * off
     step = inverse * values
     least = arb(2) ** (8 - PRECISION)
     reach = entries(magnitude(step))
     for _ in range(INFLATIONS):
         radii = [(2 * x + least).upper() for x in reach]
         box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
-        _, slopes, by_given = at(box, given)
+        _, slopes, by_parameters = evaluate(box, parameters)
         image = middle - step - (inverse * slopes - 1) * (box - middle)
         pairs = zip(entries(box), entries(image), strict=True)
         if all(wide.contains_interior(narrow) for wide, narrow in pairs):
@@ -65,9 +67,9 @@ def krawczyk(
     else:
         raise Refused(reason)
     back = slopes.inv()
-    linear = -1 * (back * by_given)
+    linear = -1 * (back * by_parameters)
     kept = linear.mid()
-    rest = magnitude(back * at(middle, middles)[0]) + magnitude(
+    remainder = magnitude(back * evaluate(middle, middles)[0]) + magnitude(
         linear - kept
     ) * magnitude(off)
-    return Root(entries(middle), kept, entries(rest))
+    return Root(entries(middle), kept, entries(remainder))

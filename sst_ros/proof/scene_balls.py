@@ -106,17 +106,19 @@ class WrittenDocument(NamedTuple):
         return cls(_unconvert(scene, (), texts), texts)
 
 
-def _unconvert(part: Any, place: Place, texts: dict[Place, str]) -> Any:
-    """Undo the conversions in a part of a scene; collect the texts of its numbers."""
-    if isinstance(part, tuple):
-        return tuple(_unconvert(x, (*place, i), texts) for i, x in enumerate(part))
-    if not isinstance(part, Section):
-        return part
-    for name, written in texts_of(part).items():
+def _unconvert(document_node: Any, place: Place, texts: dict[Place, str]) -> Any:
+    """Undo the conversions below a node; collect the texts of its numbers."""
+    if isinstance(document_node, tuple):
+        return tuple(
+            _unconvert(x, (*place, i), texts) for i, x in enumerate(document_node)
+        )
+    if not isinstance(document_node, Section):
+        return document_node
+    for name, written in texts_of(document_node).items():
         _collect_texts(written, (*place, name), texts)
-    fields = vars(part) | converted_of(part)
+    fields = vars(document_node) | converted_of(document_node)
     return build_unchecked(
-        type(part),
+        type(document_node),
         {name: _unconvert(x, (*place, name), texts) for name, x in fields.items()},
     )
 
@@ -135,13 +137,13 @@ def _collect_texts(written: Any, place: Place, texts: dict[Place, str]) -> None:
 def convert(scene: Any, degree: Any) -> Derived:
     """Convert a document in symbols as reading it does; `degree` is pi / 180."""
     values: dict[Place, Any] = {}
-    for place, part in walk(scene):
-        if isinstance(part, Base) and part.arcs_deg is not None:
-            arcs = triple(degree * arc for arc in part.arcs_deg)
+    for place, section in walk(scene):
+        if isinstance(section, Base) and section.arcs_deg is not None:
+            arcs = triple(degree * arc for arc in section.arcs_deg)
             corners: Place = (*place, "v")
             values[corners] = _triangle(*arcs)
-        if isinstance(part, Link) and part.inertia_about == ABOUT_CENTRE:
-            numbers = shift_inertia(part.inertia, part.mass, part.centre)
+        if isinstance(section, Link) and section.inertia_about == ABOUT_CENTRE:
+            numbers = shift_inertia(section.inertia, section.mass, section.centre)
             named = dict(zip(Inertia.SPECS, numbers, strict=True))
             shifted: Place = (*place, "inertia")
             values[shifted] = build_unchecked(Inertia, named)
@@ -279,11 +281,14 @@ def _balls_of(
     document: WrittenDocument,
     origin: str,
 ) -> Iterator[tuple[Place, Any]]:
-    numbers, name = leaves(document.scene), f"ranges[{key}]"
+    numbers = leaves(document.scene)
+    name = f"ranges[{key}]"
     if width == "digits":
         written = [place for place in places if place in document.texts]
-        allowed = "has no written digits: give a half-width, or the scene as a document"
-        refuse_unless(origin, (name, width, bool(written), allowed))
+        requirement = (
+            "has no written digits: give a half-width, or the scene as a document"
+        )
+        refuse_unless(origin, (name, width, bool(written), requirement))
         for place in written:
             text = document.texts[place]
             yield (
@@ -291,11 +296,11 @@ def _balls_of(
                 number_ball(numbers[place], text) + arb(0, half_unit(text).upper()),
             )
         return
-    allowed = 'must be a half-width >= 0, an interval (low, high), or "digits"'
+    requirement = 'must be a half-width >= 0, an interval (low, high), or "digits"'
     if isinstance(width, (tuple, list)):
         is_interval = len(width) == 2 and all(map(_is_bounded, width))
         refuse_unless(
-            origin, (name, width, is_interval and width[0] <= width[1], allowed)
+            origin, (name, width, is_interval and width[0] <= width[1], requirement)
         )
         low, high = map(float, width)
         for place in places:
@@ -305,7 +310,7 @@ def _balls_of(
             yield place, between(arb(low), arb(high)).union(number_ball(numbers[place]))
         return
     is_width = _is_bounded(width) and float(width) >= 0.0
-    refuse_unless(origin, (name, width, is_width, allowed))
+    refuse_unless(origin, (name, width, is_width, requirement))
     for place in places:
         digits = document.texts.get(place)
         yield place, number_ball(numbers[place], digits) + arb(0, float(width))
@@ -379,11 +384,13 @@ class _Constants:
 
     def expressions(self, symbols: Iterable[Any], reading: Any) -> dict[Place, Any]:
         """Return the numbers by place, in symbols of their names and of r."""
-        rest = iter(symbols)
+        remaining_symbols = iter(symbols)
         numbers = {}
         for place, has_slope in self._slopes.items():
-            number = next(rest)
-            numbers[place] = number + next(rest) * reading if has_slope else number
+            number = next(remaining_symbols)
+            if has_slope:
+                number = number + next(remaining_symbols) * reading
+            numbers[place] = number
         return numbers
 
 
@@ -482,9 +489,9 @@ class SceneBalls:
             numbers = dict(zip(self._varied, symbols, strict=False))
             numbers |= zip(self._symbols, symbols[len(varied) :], strict=True)
             rows = walk(self._convert(numbers))
-            found = [(p, x) for p, x in rows if isinstance(x, Expression)]
-            places[:] = [place for place, _ in found]
-            return [x for _, x in found]
+            expressions = [(p, x) for p, x in rows if isinstance(x, Expression)]
+            places[:] = [place for place, _ in expressions]
+            return [x for _, x in expressions]
 
         program = trace(traced, names)
         ranges = list(self._varied.values())
@@ -525,27 +532,37 @@ class SceneBalls:
             p: x for p, x in self._settled.items() if isinstance(x, NumberReading)
         }
         folded = {p: x for p, x in self._settled.items() if isinstance(x, float)}
-        symbols, derived = (
-            _Constants("c", self._symbols),
-            _Constants("d", derived_readings),
-        )
+        symbols = _Constants("c", self._symbols)
+        derived = _Constants("d", derived_readings)
 
         def traced(*values: Any) -> Any:
-            rest = iter(values)
-            given = list(islice(rest, len(inputs)))
-            varied = dict(zip(self.inputs, islice(rest, len(self.inputs)), strict=True))
+            remaining_symbols = iter(values)
+            function_inputs = list(islice(remaining_symbols, len(inputs)))
+            varied = dict(
+                zip(
+                    self.inputs,
+                    islice(remaining_symbols, len(self.inputs)),
+                    strict=True,
+                )
+            )
             reading = varied.pop(READING, 0.0)
-            numbers = symbols.expressions(islice(rest, len(symbols)), reading)
+            numbers = symbols.expressions(
+                islice(remaining_symbols, len(symbols)), reading
+            )
             numbers |= zip(self._varied, varied.values(), strict=True)
-            known = derived.expressions(rest, reading)
-            marked = {place: mark_present(x) for place, x in (known | folded).items()}
-            parts = rebuild(self._convert(numbers), marked)
-            model = kernel.model_of(parts.scene, parts.axes)
+            derived_numbers = derived.expressions(remaining_symbols, reading)
+            marked = {
+                place: mark_present(x)
+                for place, x in (derived_numbers | folded).items()
+            }
+            derived_scene = rebuild(self._convert(numbers), marked)
+            model = kernel.model_of(derived_scene.scene, derived_scene.axes)
             present = {
                 p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)
             }
             return function(
-                Parts(rebuild(model, present), parts.axes, parts.scene), *given
+                Parts(rebuild(model, present), derived_scene.axes, derived_scene.scene),
+                *function_inputs,
             )
 
         names = (*inputs, *self.inputs, *symbols.names, *derived.names)

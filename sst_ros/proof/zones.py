@@ -154,8 +154,8 @@ def enclose_geometry(scene: Scene, ranges: Mapping[Place, Any]) -> TolerantGeome
     Raises InputError where the ranges are so wide that nothing would be proven.
     """
 
-    def vectors(parts: Parts) -> list[Any]:
-        axes = parts.axes
+    def vectors(traced_scene: Parts) -> list[Any]:
+        axes = traced_scene.axes
         sine, cosine = sin(axes.beta_max), cos(axes.beta_max)
         reach = []
         for e in axes.e:
@@ -165,9 +165,9 @@ def enclose_geometry(scene: Scene, ranges: Mapping[Place, Any]) -> TolerantGeome
         return [component for row in rows for component in row]
 
     size = 36
-    allowed = f"must move no axis by more than {WIDEST_ZONE} rad"
+    requirement = f"must move no axis by more than {WIDEST_ZONE} rad"
     named = [key_of(place) for place in ranges]
-    with refuse_errors("certify_zone", "ranges", named, allowed, ArithmeticError):
+    with refuse_errors("certify_zone", "ranges", named, requirement, ArithmeticError):
         balls = SceneBalls(scene, None, ranges)
         run = balls.compile(vectors, (), balls.inputs)
         varied = balls.varied_balls
@@ -177,16 +177,16 @@ def enclose_geometry(scene: Scene, ranges: Mapping[Place, Any]) -> TolerantGeome
     tolerance, rounding = [], []
     for row in range(0, size, 3):
         off = [middle[i] - nominal[i] for i in range(row, row + 3)]
-        near = _length(off)
+        nominal_error = _length(off)
         moved = arb(0)
         for j, ball in enumerate(varied):
             first = size * j + row
             moved += _length(slopes[first : first + 3]) * ball.rad()
-        rounding.append(ARC_OF_CHORD * upper(near) + ZONE_ROUNDING)
-        tolerance.append(ARC_OF_CHORD * upper(near + moved) + ZONE_ROUNDING)
+        rounding.append(ARC_OF_CHORD * upper(nominal_error) + ZONE_ROUNDING)
+        tolerance.append(ARC_OF_CHORD * upper(nominal_error + moved) + ZONE_ROUNDING)
     widest = max(tolerance)
     fits = math.isfinite(widest) and widest <= WIDEST_ZONE
-    refuse_unless("certify_zone", ("ranges", named, fits, allowed))
+    refuse_unless("certify_zone", ("ranges", named, fits, requirement))
     return TolerantGeometry(
         UnitVectors(*np.array(nominal).reshape(4, 3, 3)),
         UnitVectors(*np.array(tolerance).reshape(4, 3)),
@@ -302,7 +302,7 @@ class Cells(NamedTuple):
     low: Array
     size: Array
     known_at: Array  # shape (n, 3)
-    known: Array  # R, shape (n, 3, 3)
+    known_rotation: Array  # R, shape (n, 3, 3)
 
     @property
     def middle(self) -> Array:
@@ -323,13 +323,13 @@ class Cells(NamedTuple):
         size[row, axis] *= 0.5
         second = self.low.copy()
         second[row, axis] += size[row, axis]
-        first_half = Cells(self.low, size, self.known_at, self.known)
+        first_half = Cells(self.low, size, self.known_at, self.known_rotation)
         return join_cells([first_half, first_half._replace(low=second)])
 
 
-def join_cells(parts: Sequence[Cells]) -> Cells:
+def join_cells(cell_groups: Sequence[Cells]) -> Cells:
     """Return all cells of some parts."""
-    return Cells(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    return Cells(*(np.concatenate(arrays) for arrays in zip(*cell_groups, strict=True)))
 
 
 class OrientationCap:
@@ -344,7 +344,9 @@ class OrientationCap:
     NAMES = "azimuth", "tilt", "torsion"
 
     def __init__(self, reference: Array, tilt: float, torsion: float) -> None:
-        self.reference, self.tilt, self.torsion = reference, tilt, torsion
+        self.reference = reference
+        self.tilt = tilt
+        self.torsion = torsion
         self._most = math.sin(0.5 * tilt)
 
     def coordinates(self, rotation: ArrayLike) -> Array:
@@ -355,21 +357,23 @@ class OrientationCap:
         relative = self.reference.T @ np.asarray(rotation, dtype=float)
         azimuth, tilt, psi = np.moveaxis(zyz_angles(relative), -1, 0)
         torsion = np.remainder(psi + azimuth + np.pi, 2.0 * np.pi) - np.pi
-        around = azimuth / (2.0 * np.pi) + 0.5
-        out = (np.sin(0.5 * tilt) / self._most) ** 2
-        about = torsion / (2.0 * self.torsion) + 0.5
-        return np.stack([around, out, about], axis=-1)
+        azimuth_share = azimuth / (2.0 * np.pi) + 0.5
+        tilt_share = (np.sin(0.5 * tilt) / self._most) ** 2
+        torsion_share = torsion / (2.0 * self.torsion) + 0.5
+        return np.stack([azimuth_share, tilt_share, torsion_share], axis=-1)
 
     def angles(self, coordinates: Array) -> Array:
         """Azimuth, tilt and torsion [rad] of coordinates, both of shape (n, 3)."""
-        around, out, about = coordinates.T
-        azimuth = 2.0 * np.pi * (around - 0.5)
-        tilt = 2.0 * np.arcsin(np.sqrt(out) * self._most)
-        return np.stack([azimuth, tilt, self.torsion * (2.0 * about - 1.0)], axis=1)
+        azimuth_share, tilt_share, torsion_share = coordinates.T
+        azimuth = 2.0 * np.pi * (azimuth_share - 0.5)
+        tilt = 2.0 * np.arcsin(np.sqrt(tilt_share) * self._most)
+        return np.stack(
+            [azimuth, tilt, self.torsion * (2.0 * torsion_share - 1.0)], axis=1
+        )
 
     def first_cell(self) -> Cells:
         """Return all orientations as one cell."""
-        return _whole(np.array([0.5, 0.0, 0.5]), self.reference)
+        return _undivided_cell(np.array([0.5, 0.0, 0.5]), self.reference)
 
     def poses(self, cells: Cells) -> PoseBalls:
         """Return balls that hold all poses of cells.
@@ -414,9 +418,11 @@ class OrientationCap:
         return np.stack([around, 0.5 * (high - low), about], axis=1)
 
 
-def _whole(known_at: Array, known: Array) -> Cells:
+def _undivided_cell(known_at: Array, known_rotation: Array) -> Cells:
     """Return the cell of all coordinates, in which one pose is known."""
-    return Cells(np.zeros((1, 3)), np.ones((1, 3)), known_at[None], known[None])
+    return Cells(
+        np.zeros((1, 3)), np.ones((1, 3)), known_at[None], known_rotation[None]
+    )
 
 
 def tilted(azimuth: Array, tilt: Array, torsion: Array) -> Array:
@@ -453,7 +459,8 @@ class GammaBox:
     NAMES = "gamma_1", "gamma_2", "gamma_3"
 
     def __init__(self, tolerant: TolerantGeometry, box: Array, start: Array) -> None:
-        self._tolerant, self._start = tolerant, start
+        self._tolerant = tolerant
+        self._start = start
         self.low, self.high = box.T
         v, w, e, _ = tolerant.tolerance
         # r_k = cos(gamma_k) v_k + sin(gamma_k) w_k x v_k
@@ -475,7 +482,7 @@ class GammaBox:
 
     def first_cell(self) -> Cells:
         """Return the whole box as one cell."""
-        return _whole(np.full(3, 0.5), self._start)
+        return _undivided_cell(np.full(3, 0.5), self._start)
 
     def longest(self, cells: Cells) -> NDArray[np.intp]:
         """Return the coordinate in which each cell is longest, shape (n,)."""
@@ -516,28 +523,29 @@ class GammaBox:
         begin, end = self.angles(cells.known_at), self.angles(cells.middle)
         segment = end - begin
         length = np.linalg.norm(segment, axis=1)
-        rotation, done = cells.known.copy(), np.zeros(len(segment))
+        rotation = cells.known_rotation.copy()
+        followed_share = np.zeros(len(segment))
         active = np.flatnonzero(length > 0.0)
         for _ in range(MOST_ZONE_STEPS):
             if not len(active):
                 break
-            here = begin[active] + done[active, None] * segment[active]
-            sigma = _least_singular(self._j2(here, rotation[active]))
-            active, sigma = (
-                active[sigma > LEAST_ZONE_SIGMA],
-                sigma[sigma > LEAST_ZONE_SIGMA],
-            )
+            gamma = begin[active] + followed_share[active, None] * segment[active]
+            sigma = _least_singular(self._j2(gamma, rotation[active]))
+            regular = sigma > LEAST_ZONE_SIGMA
+            active, sigma = active[regular], sigma[regular]
             step = SAFE_SHARE * sigma**2
-            share = np.minimum(done[active] + step / length[active], 1.0)
-            there = begin[active] + share[:, None] * segment[active]
-            moved, near = self._newton(there, rotation[active])
-            change = np.abs(share - done[active])[:, None] * np.abs(segment[active])
+            share = np.minimum(followed_share[active] + step / length[active], 1.0)
+            target = begin[active] + share[:, None] * segment[active]
+            moved, closes = self._newton(target, rotation[active])
+            change = np.abs(share - followed_share[active])[:, None] * np.abs(
+                segment[active]
+            )
             reach = _reach_of_assembly(change + ZONE_ROUNDING, sigma)
-            safe = near & (_angle(rotation[active], moved) < reach)
+            safe = closes & (_angle(rotation[active], moved) < reach)
             active = active[safe]
-            rotation[active], done[active] = moved[safe], share[safe]
+            rotation[active], followed_share[active] = moved[safe], share[safe]
             active = active[share[safe] < 1.0]
-        return rotation, (length == 0.0) | (done == 1.0)
+        return rotation, (length == 0.0) | (followed_share == 1.0)
 
     def _rows(self, gamma: Array, rotation: Array) -> tuple[Array, Array]:
         """Directions r_k and t_k, shape (n, 3, 3) each."""
@@ -615,20 +623,22 @@ def subdivide(
     cells = zone.first_cell()
     while len(cells.low) and examined < max_boxes:
         block = cells.rows(slice(0, min(ZONE_BLOCK, max_boxes - examined)))
-        rest = cells.rows(slice(len(block.low), None))
+        later_cells = cells.rows(slice(len(block.low), None))
         poses = zone.poses(block)
         verdicts = decide(geometry, poses, side)
         examined += len(block.low)
         followed = poses.status == PROVEN
         block = block._replace(
             known_at=np.where(followed[:, None], block.middle, block.known_at),
-            known=np.where(followed[:, None, None], poses.rotation, block.known),
+            known_rotation=np.where(
+                followed[:, None, None], poses.rotation, block.known_rotation
+            ),
         )
         is_open = verdicts.status == OPEN
         leaves.append(block.rows(~is_open))
         decided.append(Verdicts(*(array[~is_open] for array in verdicts)))
         larger = block.rows(is_open)
-        cells = join_cells([rest, larger.halve(zone.longest(larger))])
+        cells = join_cells([later_cells, larger.halve(zone.longest(larger))])
         bar.draw(examined / max_boxes)
     bar.draw(1.0)
     leaves.append(cells)
@@ -682,10 +692,13 @@ class ProvenZone(Explained):
         reference: Array,
         parts: Subdivision,
     ) -> None:
-        self.scene, self.reference, self.examined = scene, reference, parts.examined
+        self.scene = scene
+        self.reference = reference
+        self.examined = parts.examined
         self.names = zone.NAMES
-        self._zone, self._cells = zone, parts.cells
-        cells, verdicts = parts.cells, parts.verdicts
+        self._zone = zone
+        self._cells = cells = parts.cells
+        verdicts = parts.verdicts
         low, high = zone.angles(cells.low), zone.angles(cells.low + cells.size)
         self.columns: dict[str, NDArray[Any]] = {}
         for i, name in enumerate(self.names):
@@ -700,7 +713,8 @@ class ProvenZone(Explained):
         for numbers in self.columns.values():
             numbers.flags.writeable = False
         # Sums of halves of halves are exact.
-        is_proven, is_refuted = verdicts.status == PROVEN, verdicts.status == REFUTED
+        is_proven = verdicts.status == PROVEN
+        is_refuted = verdicts.status == REFUTED
         self.proven = float(share[is_proven].sum())
         self.refuted = float(share[is_refuted].sum())
         self.open = 1.0 - self.proven - self.refuted
@@ -742,12 +756,12 @@ class ProvenZone(Explained):
     @property
     def shares(self) -> str:
         """The shares in words, rounded outward."""
-        words = [f"{percent_down(self.proven, 6)} proven"]
+        phrases = [f"{percent_down(self.proven, 6)} proven"]
         if self.refuted:
-            words.append(f"{percent_down(self.refuted, 6)} refuted")
+            phrases.append(f"{percent_down(self.refuted, 6)} refuted")
         if self.open:
-            words.append(f"{percent_up(self.open, 6)} open")
-        return ", ".join(words)
+            phrases.append(f"{percent_up(self.open, 6)} open")
+        return ", ".join(phrases)
 
     def status_of(self, poses: ArrayLike) -> NDArray[np.int8]:
         """Return the status of poses, shape (m,).
@@ -806,8 +820,8 @@ class ProvenZone(Explained):
         shares = {name: share for name, share in self.refuted_by.items() if share}
         if shares:
             largest = sorted(shares, key=shares.__getitem__, reverse=True)[:3]
-            words = [f"{percent_down(shares[x], 3)} {x}" for x in largest]
-            facts["refuted by"] = ", ".join(words)
+            limit_shares = [f"{percent_down(shares[x], 3)} {x}" for x in largest]
+            facts["refuted by"] = ", ".join(limit_shares)
         if self.proven:
             facts["abs(det J2)"] = f"above {write_down(self.least_det_j2, 3)}"
             facts["sin(mu)"] = f"above {write_down(self.least_sine_mu, 3)}"
@@ -873,22 +887,22 @@ def certify_zone(
         MissingDependency: python-flint is not installed.
 
     """
-    given = scene_of(scene)
+    checked_scene = scene_of(scene)
     _check_arguments(gamma_box, tilt, torsion, orientation, max_boxes)
-    geometry = Geometry.of(given)
+    geometry = Geometry.of(checked_scene)
     box = None if gamma_box is None else np.array(gamma_box, dtype=float)
-    reference, det_j2 = _reference_pose(given, box, orientation)
+    reference, det_j2 = _reference_pose(checked_scene, box, orientation)
     if abs(det_j2) < LEAST_DET_J2:
         raise SingularConfiguration("parallel singularity, det J2 = 0", det_j2)
     with precision():
         balls = range_balls(
-            WrittenDocument.of(given),
+            WrittenDocument.of(checked_scene),
             ranges or {},
             own_torque=True,
             origin="certify_zone",
         )
         _refuse_other_ranges(balls)
-        tolerant = enclose_geometry(given, balls)
+        tolerant = enclose_geometry(checked_scene, balls)
     zone: OrientationCap | GammaBox
     if box is not None:
         zone = GammaBox(tolerant, box, reference)
@@ -898,8 +912,8 @@ def certify_zone(
         zone = OrientationCap(reference, min(widest, MOST_TILT), float(torsion))
     side = -math.copysign(1.0, det_j2)
     bar = Bar("certify_zone", progress)
-    parts = subdivide(zone, tolerant, side, max_boxes, bar)
-    return ProvenZone(given, zone, reference, parts)
+    subdivision = subdivide(zone, tolerant, side, max_boxes, bar)
+    return ProvenZone(checked_scene, zone, reference, subdivision)
 
 
 def _reference_pose(
@@ -908,17 +922,19 @@ def _reference_pose(
     """Return R of the reference pose, shape (3, 3), and its det J2."""
     geometry = Geometry.of(scene)
     selected = scene.initial.orientation if orientation is None else orientation
-    near = None if selected is None else rotation_matrix(selected)
+    selected_rotation = None if selected is None else rotation_matrix(selected)
     if orientation is not None and box is None:
-        assert near is not None
-        gamma, _, _ = kinematics.inverse(geometry, near)
-        measured = measures(geometry, gamma, near)
-        allowed = "must be inside all limits of the scene"
+        assert selected_rotation is not None
+        gamma, _, _ = kinematics.inverse(geometry, selected_rotation)
+        measured = measures(geometry, gamma, selected_rotation)
+        requirement = "must be inside all limits of the scene"
         is_inside = bool(measured.admissible)
-        refuse_unless("certify_zone", ("orientation", orientation, is_inside, allowed))
-        return near, float(measured.det_j2)
+        refuse_unless(
+            "certify_zone", ("orientation", orientation, is_inside, requirement)
+        )
+        return selected_rotation, float(measured.det_j2)
     angles = scene.initial.gamma if box is None else box.mean(axis=1)
-    start = kinematics.admissible(geometry, angles, near)
+    start = kinematics.admissible(geometry, angles, selected_rotation)
     return np.array(start.rotation), start.det_j2
 
 
@@ -935,22 +951,22 @@ def _check_arguments(
         box = read_numbers("certify_zone", "gamma_box", gamma_box)
         is_box = box.shape == (3, 2) and bool(np.all(np.isfinite(box)))
         is_box = is_box and bool(np.all(box[:, 0] < box[:, 1]))
-        allowed = "must be the least and the largest angle of three actuators [rad]"
-        checks.append(("gamma_box", gamma_box, is_box, allowed))
+        requirement = "must be the least and the largest angle of three actuators [rad]"
+        checks.append(("gamma_box", gamma_box, is_box, requirement))
         alone = tilt is None and torsion == math.pi
-        allowed = "are those of a cap: leave them out with gamma_box"
-        checks.append(("tilt, torsion", (tilt, torsion), alone, allowed))
+        requirement = "are those of a cap: leave them out with gamma_box"
+        checks.append(("tilt, torsion", (tilt, torsion), alone, requirement))
     if orientation is not None:
         q = read_numbers("certify_zone", "orientation", orientation)
         is_quaternion = q.shape == (4,) and bool(np.all(np.isfinite(q)) and np.any(q))
-        allowed = "must be a quaternion (x, y, z, w), not zero"
-        checks.append(("orientation", orientation, is_quaternion, allowed))
+        requirement = "must be a quaternion (x, y, z, w), not zero"
+        checks.append(("orientation", orientation, is_quaternion, requirement))
     is_tilt = tilt is None or 0.0 < tilt <= MOST_TILT
     checks.append(("tilt", tilt, is_tilt, f"must be > 0 and at most {MOST_TILT:g} rad"))
     is_torsion = 0.0 < torsion <= math.pi
     checks.append(("torsion", torsion, is_torsion, "must be > 0 and at most pi [rad]"))
-    allowed = f"must be from 1 to {MOST_BOXES}"
-    checks.append(("max_boxes", max_boxes, 1 <= max_boxes <= MOST_BOXES, allowed))
+    requirement = f"must be from 1 to {MOST_BOXES}"
+    checks.append(("max_boxes", max_boxes, 1 <= max_boxes <= MOST_BOXES, requirement))
     refuse_unless("certify_zone", *checks)
 
 
@@ -958,8 +974,10 @@ def _refuse_other_ranges(balls: Mapping[Place, Any]) -> None:
     """Refuse ranges of numbers that the geometry does not depend on."""
     for place in balls:
         is_geometry = any(place[: len(key)] == key for key in GEOMETRY_KEYS)
-        allowed = (
+        requirement = (
             "is no part of the geometry, which is "
             f"{', '.join(map(key_of, GEOMETRY_KEYS))}"
         )
-        refuse_unless("certify_zone", ("ranges", key_of(place), is_geometry, allowed))
+        refuse_unless(
+            "certify_zone", ("ranges", key_of(place), is_geometry, requirement)
+        )
