@@ -75,9 +75,10 @@ class Inertia(Section):
 class Base(Section):
     """The fixed spherical triangle P1 P2 P3 in {B}, by directions v or by its arcs.
 
-    The arcs 1-2, 2-3, 3-1 say nothing of {B}; then P1 is on its x axis, P2 in its xy
-    plane with y > 0, and P3 above that: v1 = (1, 0, 0), v2 = (cos a12, sin a12, 0), v3
-    = (cos a31, y, z > 0) with v2 . v3 = cos a23. A scene that is read has these v.
+    The arcs 1-2, 2-3, 3-1 do not place the triangle in {B}: P1 is then put on the x
+    axis of {B}, P2 in its xy plane with y > 0, and P3 above that plane: v1 = (1, 0, 0),
+    v2 = (cos a12, sin a12, 0), v3 = (cos a31, y, z > 0) with v2 . v3 = cos a23. A scene
+    that is read has these v.
     """
 
     ONE_OF = "v", "arcs_deg"
