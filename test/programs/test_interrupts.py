@@ -36,7 +36,7 @@ except KeyboardInterrupt:
 """
 """`first` has the code compiled; the line comes some time after `call` has begun, which
 takes minutes and more where nothing ends it. The process ends at once: CPython gives it
-the signal as its status where Ctrl-C came inside of an `exec` of a text, of any package.
+the signal as its status where Ctrl-C came inside the `exec` of a text, of any package.
 """
 
 CALLS = {
