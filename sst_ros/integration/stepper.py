@@ -8,7 +8,7 @@
 3. `auto` looks at the eigenvalues of the Jacobian now and then, and takes the method
    whose steps would be longer.
 4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of
-them.
+   them.
 5. A step does not leap over the rates within which Coulomb friction changes its sign.
 6. A limit ends the motion: LimitReached. So does a motion that no step resolves:
 CannotStep.
@@ -417,15 +417,15 @@ class Stepper:
                 longest = _next_length(point, h, error, cut=stopped or h == left)
                 if passed > 0.0:  # the next step is not to be refused for a leap
                     longest = min(longest, _SAFETY * h / passed)
-                looks = self._chooses and (
+                counts_attempt = self._chooses and (
                     h < left or isinstance(point.method, Rosenbrock)
                 )
-                attempts = point.attempts + 1 if looks else point.attempts
+                attempts = point.attempts + 1 if counts_attempt else point.attempts
                 end_point = Point(
                     after.y, after.z, after.joints, point.method, longest, attempts,
                     after.steps, point.changes,
                 )  # fmt: skip
-                if looks:
+                if counts_attempt:
                     end_point = self._choose_method(
                         steps, t + h, h, end_point, drive, 0
                     )

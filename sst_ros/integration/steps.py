@@ -247,17 +247,19 @@ def size_of_error(
     largest: Number = 0.0
     for number in error[:4]:
         largest = larger(largest, absolute(number))
-    rate, worst = _compare(error, old, new, slice(4, 7), least=0.0)
+    rate, worst = _measure_error(error, old, new, slice(4, 7), least=0.0)
     least_rate = _RADIANS_PER_STEP / absolute(h)
     largest = larger(largest, worst / larger(rate, least_rate))
     if lagged:
         torques = slice(7, 7 + lagged)
-        torque, worst = _compare(error, old, new, torques, least=_NO_DIVISION_BY_ZERO)
+        torque, worst = _measure_error(
+            error, old, new, torques, least=_NO_DIVISION_BY_ZERO
+        )
         largest = larger(largest, worst / torque)
     return largest
 
 
-def _compare(
+def _measure_error(
     error: Numbers, old: Numbers, new: Numbers, indices: slice, least: float
 ) -> tuple[Number, Number]:
     """Return the largest absolute number at some indices, and the largest error.

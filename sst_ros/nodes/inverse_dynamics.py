@@ -53,7 +53,7 @@ FOLLOWER_KEYS = {
 _FEEDBACK_PERIOD_S = 0.05
 _STREAM_LOG_PERIOD_S = 1.0  # trajectories of a stream are not logged more often
 _SPINS_AT_END = 20
-# least time to deliver the result of a goal that the end of the node aborts: 0.2 s
+"""Spins to deliver the result of a goal that the end of the node aborts: 0.2 s."""
 _SPIN_S = 0.01
 
 
@@ -65,19 +65,21 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def __init__(self) -> None:
         super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
-        parameters, own = self.parameters, topics.CONTROLLER
+        parameters = self.parameters
+        own = topics.CONTROLLER
         self.follower = TrajectoryFollower(scene.load(parameters.scene), parameters)
         names = ("reference", "tracking_error", "diagnostics")
         publishers = (own[name].publisher(self.node) for name in names)
         self._reference, self._error, self._diagnostics = publishers
         self._measured: Measurement | None = None
         self._measured_ns = 0
-        self._refused, self._last_refusal = 0, ""
+        self._refused = 0
+        self._last_refusal = ""
         self._has_heard = False
         self._active: topics.ActionGoal | None = None
         # the active one, or accepted last
         self._goal: tuple[TrajectoryGoal, Order] | None = None
-        # later it would delay the control
+        # Loads the template now: later that would delay the control.
         render("tracking.txt", found=TrackingMetrics())
         self._feedback: Any = None
         self._action_type: Any = None  # FollowJointTrajectory, where that is installed
@@ -127,8 +129,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         of the run.
         """
         super().hear(phase)
-        news, self._has_heard = self._has_heard, True
-        if phase.data == "waiting" and self.begun and news:
+        is_first = not self._has_heard
+        self._has_heard = True
+        if phase.data == "waiting" and self.begun and not is_first:
             self.node.get_logger().info("the simulator was reset: beginning anew")
             self._interrupt("the simulator was reset")
             _print(self.follower.tracking())
@@ -137,10 +140,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def see(self, state: JointState) -> None:
         """Measure a state: trajectories begin at the last one."""
-        self._measured, self._measured_ns = (
-            _measure(state),
-            nanoseconds(state.header.stamp),
-        )
+        self._measured = _measure(state)
+        self._measured_ns = nanoseconds(state.header.stamp)
 
     def receive(self, state: JointState) -> None:
         """Answer a state where there is a motion."""
@@ -172,10 +173,10 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def answer(self, state: JointState, stamp_ns: int) -> None:
         """Answer a sample of the run."""
-        if (
-            self._measured is None
-            or (command := self.follower.answer(stamp_ns, self._measured)) is None
-        ):
+        if self._measured is None:
+            return
+        command = self.follower.answer(stamp_ns, self._measured)
+        if command is None:
             return
         self.begun = True
         self.send(command.torque)
@@ -195,10 +196,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         ):
             position, velocity, effort = (array("d", triple) for triple in numbers)
             message = JointState(position=position, velocity=velocity, effort=effort)
-            message.header.stamp, message.name = (
-                state.header.stamp,
-                list(ACTUATED_JOINTS),
-            )
+            message.header.stamp = state.header.stamp
+            message.name = list(ACTUATED_JOINTS)
             publisher.publish(message)
 
     def _replace(self, trajectory: JointTrajectory) -> None:
@@ -242,7 +241,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
 
     def _refuse(self, error: BaseException) -> None:
         """Count, log and publish a refusal."""
-        self._refused, self._last_refusal = self._refused + 1, str(error)
+        self._refused += 1
+        self._last_refusal = str(error)
         self.node.get_logger().error(f"trajectory refused: {error}")
         self._report()
 
@@ -272,10 +272,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             "a trajectory was refused": self._refused,
         }
         statements = [stage, *(text for text, count in doubts.items() if count)]
-        values, level = (
-            dict(zip(FOLLOWER_KEYS, row, strict=True)),
-            int(len(statements) > 1),
-        )
+        values = dict(zip(FOLLOWER_KEYS, row, strict=True))
+        level = int(len(statements) > 1)
         message = topics.diagnostics(
             self.node, "control", level, "; ".join(statements), values
         )

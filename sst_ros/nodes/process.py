@@ -51,8 +51,11 @@ _PROFILES = {
 
 The first is for Fast DDS 2, libfastrtps, the second for Fast DDS 3, libfastdds.
 """
-# longest delay of a signal. The executor would take half a millisecond for each look
 _ORPHAN_POLL_S = 0.1
+"""Longest delay of a signal.
+
+The executor would take half a millisecond for each look.
+"""
 _CALLBACK_S = 1.0
 """Wait for a callback in progress.
 
@@ -98,7 +101,8 @@ class Worker(Generic[P]):
         cls: type[P],
         dependent_defaults: Defaults = lambda overrides: {},
     ) -> None:
-        self.node, self.done = Node(node), threading.Event()
+        self.node = Node(node)
+        self.done = threading.Event()
         self.failure: BaseException | None = None
         self.parameters = _declare(self.node, cls, dependent_defaults)
         self.node.add_on_set_parameters_callback(self._set)
@@ -152,11 +156,10 @@ def _declare(node: Node, cls: type[P], dependent_defaults: Defaults) -> P:
     overrides: dict[str, Any] = {
         name: parameter.value for name, parameter in node._parameter_overrides.items()
     }
-    defaults, values = (
-        {**vars(cls()), **dependent_defaults(overrides)},
-        dict[str, Any](),
-    )
-    origin, checks = node.get_fully_qualified_name(), list[Check]()
+    defaults = {**vars(cls()), **dependent_defaults(overrides)}
+    values = dict[str, Any]()
+    origin = node.get_fully_qualified_name()
+    checks = list[Check]()
     for name, spec in cls.SPECS.items():
         value = _plain_value(spec, overrides.get(name, defaults[name]))
         values[name] = value
@@ -169,13 +172,13 @@ def _declare(node: Node, cls: type[P], dependent_defaults: Defaults) -> P:
                 node.declare_parameter(name, value, descriptor, ignore_override=True)
         except ParameterException:  # of another type, or out of range
             checks.append((name, value, False, spec.describe()))
-    ours = {
+    names_of_all_nodes = {
         name
         for _, parameters in settings.NODE_COMMANDS.values()
         for name in parameters.SPECS
     }
     for name in sorted(overrides.keys() - values.keys()):
-        if name in ours:  # nodes may share a parameter file
+        if name in names_of_all_nodes:  # nodes may share a parameter file
             node.get_logger().info(f"parameter {name} is one of another node: not used")
         elif not name.startswith(arguments.FOREIGN):
             checks.append(arguments.unknown_name(name, values))
@@ -251,22 +254,22 @@ class AnsweringWorker(Worker[A]):
 
         Call this as soon as the node can answer.
         """
-        parameters, self._own = self.parameters, own
+        parameters = self.parameters
+        self._own = own
         self.begun = self.commanded = False
         self.phase = ""
         self.heard_s = time.monotonic()
         self.foreign_states = 0
-        topic, torques = (
-            own["commands_stamped" if parameters.stamped else "commands"],
-            array("d", ZERO),
-        )
+        # One message for all commands, whose torques are set in place.
+        torques = array("d", ZERO)
         if parameters.stamped:
+            topic = own["commands_stamped"]
             self._message: Any = topic.kind(name=list(ACTUATED_JOINTS), effort=torques)
+            self._torques = self._message.effort
         else:
+            topic = own["commands"]
             self._message = topic.kind(data=torques)
-        self._torques = (
-            self._message.effort if parameters.stamped else self._message.data
-        )
+            self._torques = self._message.data
         self._commands = topic.publisher(self.node, simulator=parameters.simulator)
         handlers = {"phase": self.hear, "joint_states": self.receive, **callbacks}
         topics.subscribe(self.node, own, parameters.simulator, **handlers)
@@ -300,10 +303,8 @@ class AnsweringWorker(Worker[A]):
 
         The parameters say how many are needed.
         """
-        count, least = (
-            self._commands.get_subscription_count(),
-            self.parameters.min_subscribers,
-        )
+        count = self._commands.get_subscription_count()
+        least = self.parameters.min_subscribers
         if count >= least:
             return []
         return [f"{self._commands.topic_name} has {count} of {least}"]
@@ -500,14 +501,14 @@ def _bound_time() -> Iterator[None]:
 
 
 def spin(worker: Worker[Any]) -> None:
-    """Run a worker until it is done or asked to end, or a callback raises.
-
-    Then close it.
+    """Run a worker until it is done or asked to end, or a callback raises; close it.
 
     The executor has a thread, which sleeps until there is work: signals would not wake
     it.
     """
-    node, ends, errors = worker.node, threading.Event(), list[BaseException]()
+    node = worker.node
+    ends = threading.Event()
+    errors = list[BaseException]()
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     wake = node.create_guard_condition(lambda: None)
@@ -566,7 +567,7 @@ def _wait_for_subscribers(node: Node) -> None:
 def configure_middleware() -> None:
     """Select our profile of Fast DDS, unless the user has selected one.
 
-    Before `rclpy.init`.
+    Call this before `rclpy.init`.
 
     By default a reliable writer asks its readers every 3 s what has arrived, and then
     removes 1500 samples at once while the publisher waits: one to three milliseconds,

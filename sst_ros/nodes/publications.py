@@ -49,9 +49,10 @@ from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, V
 
 LOG_NS = 50_000_000
 """Torques are published once for about this time, not with each sample."""
-_HISTORY_S = 2
-_FAST = 10
-_LEAST_DEPTH, _MOST_DEPTH = 10, 20_000
+_HISTORY_S = 2  # of messages that are kept for slow readers
+_FAST = 10  # real-time factor that the history of a run without deadlines is made for
+_LEAST_DEPTH = 10
+_MOST_DEPTH = 20_000
 _AT_REST = (0.0,) * len(JOINTS)
 _PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATED_JOINTS))
 _SENSORS = ("imu", "reaction")
@@ -149,7 +150,8 @@ class TorqueLog:
     def __init__(
         self, period_ns: int, *, moments: bool = False, base_frame: str = BASE_FRAME
     ) -> None:
-        self._period_ns, self._moments = period_ns, moments
+        self._period_ns = period_ns
+        self._moments = moments
         names = (*ACTUATED_JOINTS, *MOMENTS) if moments else ACTUATED_JOINTS
         self._message = JointTrajectory(joint_names=list(names))
         self._message.header.frame_id = base_frame
@@ -218,7 +220,8 @@ class SimulatorTopics:
     """Publishers of the simulator: the `RunOutput` of its run."""
 
     def __init__(self, node: Node, scene: Scene, settings: SimulatorParameters) -> None:
-        self._node, own = node, topics.SIMULATOR
+        self._node = node
+        own = topics.SIMULATOR
         self._clock: Publisher[Clock] | None = None
         if settings.publish_clock:
             self._clock = own["clock"].publisher(node)
@@ -327,7 +330,8 @@ class SimulatorTopics:
         if not 0 < logged < self._log_ticks or not self._are_torques_read:
             self.flush()
             self._log_from_ns = stamp_ns
-        stamp, numbers = time_of(stamp_ns), self._numbers_of(simulation)
+        stamp = time_of(stamp_ns)
+        numbers = self._numbers_of(simulation)
         for key, publisher in self._read.items():
             message = self._samples[key].fill(stamp, numbers)
             if message is not None:
@@ -363,10 +367,8 @@ class SimulatorTopics:
         self.flush()
         self._torques.publish(self._log.take(0))
         joints = state.joints
-        angles, rates = (
-            joints.gamma + joints.mu + joints.beta,
-            joints.gamma_dot + joints.mu_dot + joints.beta_dot,
-        )
+        angles = joints.gamma + joints.mu + joints.beta
+        rates = joints.gamma_dot + joints.mu_dot + joints.beta_dot
         numbers = Numbers(state.quaternion, angles, rates, state.torque)
         if at_rest:
             numbers = numbers._replace(rates=_AT_REST, torque=ZERO)

@@ -109,10 +109,8 @@ class RecordedTopic:
             self.heard = not self.shared or _is_of_simulator(
                 deserialize_message(data, message_type)
             )
-        number, publisher = (
-            info.get("publication_sequence_number"),
-            info.get("publisher_gid"),
-        )
+        number = info.get("publication_sequence_number")
+        publisher = info.get("publisher_gid")
         if self.counted and number and publisher:
             last = self._last.get(publisher["data"], number - 1)
             self.lost += max(0, number - last - 1)
@@ -143,7 +141,8 @@ class Recorder(Worker[RecorderParameters]):
         self._unknown: set[str] = set()
         self._ready = False
         self._failure: SstError | None = None
-        self._timeout_s, self._began_s = parameters.timeout, time.monotonic()
+        self._timeout_s = parameters.timeout
+        self._began_s = time.monotonic()
         dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
         self._bag = BagWriter(
             Path(dated if parameters.output == "-" else parameters.output)
@@ -190,7 +189,8 @@ class Recorder(Worker[RecorderParameters]):
         expects that the run is recorded. So they are subscribed to when the simulator's
         own topics have been heard.
         """
-        silent, new = self._missing() & self._required, False
+        silent = self._missing() & self._required
+        new = False
         for topic, types in self.node.get_topic_names_and_types():
             if (
                 topic in self._requested
@@ -204,10 +204,8 @@ class Recorder(Worker[RecorderParameters]):
         if self._ready:
             return
         waiting = silent | (self._foreign - self._recorded.keys())
-        text, log = (
-            f"waiting for {_join(waiting or self._requested)}",
-            self.node.get_logger(),
-        )
+        text = f"waiting for {_join(waiting or self._requested)}"
+        log = self.node.get_logger()
         if self._recorded and not (new or waiting):
             self._ready = True
             print(f"ready: {len(self._recorded)} topics", flush=True)
@@ -234,10 +232,8 @@ class Recorder(Worker[RecorderParameters]):
             return
         # That which all publishers can serve; of a topic of ours whatever discovery has
         # found.
-        durability, reliability = (
-            DurabilityPolicy.VOLATILE,
-            ReliabilityPolicy.BEST_EFFORT,
-        )
+        durability = DurabilityPolicy.VOLATILE
+        reliability = ReliabilityPolicy.BEST_EFFORT
         if all(
             offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers
         ):
@@ -245,7 +241,8 @@ class Recorder(Worker[RecorderParameters]):
         if all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers):
             reliability = ReliabilityPolicy.RELIABLE
         qos = QoSProfile(depth=_DEPTH, durability=durability, reliability=reliability)
-        message_type, group = topics.message_type(type_name), topics.NeverSpun()
+        message_type = topics.message_type(type_name)
+        group = topics.NeverSpun()
         subscription = self.node.create_subscription(
             message_type, topic, lambda _: None, qos, callback_group=group, raw=True
         )

@@ -108,7 +108,8 @@ class Simulator(Worker[SimulatorParameters]):
 
     def change(self, changed: SimulatorParameters) -> None:
         """Take over parameters that were set, and the speed between two samples."""
-        before, self.parameters = self.parameters, changed
+        before = self.parameters
+        self.parameters = changed
         vars(self._run).update(vars(changed.run))  # its times, as all else stays
         if changed.real_time_factor != before.real_time_factor:
             self._loop.post(self._change_speed)
@@ -118,23 +119,17 @@ class Simulator(Worker[SimulatorParameters]):
         self._pacer.change(self.parameters.real_time_factor)
 
     def _schedule(self) -> None:
-        """Real-time scheduling for a run that sleeps.
+        """Ask for real-time scheduling where the run sleeps between deadlines.
 
-        Without deadlines it would starve others.
-
-        The machine may sleep as it likes where no deadlines are kept.
+        Without deadlines it would starve others, and the cores may sleep as they like.
         """
-        parameters, thread, diagnostics = (
-            self.parameters,
-            self._thread.native_id,
-            self._diagnostics,
-        )
+        parameters = self.parameters
+        thread = self._thread.native_id
+        diagnostics = self._diagnostics
         if thread is None or not self._thread.is_alive():
             return
-        paced, running = (
-            parameters.real_time_factor > 0.0,
-            self._loop.phase is Phase.RUNNING,
-        )
+        paced = parameters.real_time_factor > 0.0
+        running = self._loop.phase is Phase.RUNNING
         try:
             scheduling = schedule(parameters.realtime_priority if paced else 0, thread)
         except ProcessLookupError:  # it has ended since
@@ -143,10 +138,9 @@ class Simulator(Worker[SimulatorParameters]):
             parameters.cpu_dma_latency if paced and running else -1
         )
         granted = {"scheduling": scheduling, "cpu_dma_latency": latency}
-        for changed in (
-            key for key in granted if granted[key] != diagnostics.granted[key]
-        ):
-            self.node.get_logger().info(f"{changed}: {granted[changed]}")
+        for key, text in granted.items():
+            if text != diagnostics.granted[key]:
+                self.node.get_logger().info(f"{key}: {text}")
         diagnostics.granted = granted
 
     def _read_gauges(self) -> None:
@@ -155,9 +149,9 @@ class Simulator(Worker[SimulatorParameters]):
     def _report(self) -> None:
         """Publish diagnostics, log what is new, request gauges for the next time."""
         self._schedule()  # the threads that have begun since: of callbacks and of DDS
-        named = self.node.resolve_topic_name
+        resolve = self.node.resolve_topic_name
         commands = [
-            named(topics.SIMULATOR[name].name)
+            resolve(topics.SIMULATOR[name].name)
             for name in ("commands", "commands_stamped")
         ]
         values = self._diagnostics.values(
@@ -177,10 +171,8 @@ class Simulator(Worker[SimulatorParameters]):
 
     def _warnings(self, commands: Sequence[str]) -> Iterator[str]:
         """Conditions of the graph that keep a run from what its user expects."""
-        own, clocks = (
-            self.node.get_fully_qualified_name(),
-            topics.publishers(self.node, "/clock"),
-        )
+        own = self.node.get_fully_qualified_name()
+        clocks = topics.publishers(self.node, "/clock")
         rivals = [name for name in clocks if name != own]
         if rivals and self.parameters.publish_clock:
             yield f"/clock is also published by {', '.join(rivals)}"
@@ -194,10 +186,9 @@ class Simulator(Worker[SimulatorParameters]):
                     f"{topic} of {name} is best effort and not received: publish it"
                     " reliably"
                 )
-        named = self.node.resolve_topic_name
-        for name in topics.publishers(
-            self.node, named(topics.SIMULATOR["joint_states"].name)
-        ):
+        joint_states = topics.SIMULATOR["joint_states"].name
+        joint_states = self.node.resolve_topic_name(joint_states)
+        for name in topics.publishers(self.node, joint_states):
             if name != own and self.node.count_publishers(f"{name}/phase"):
                 yield (
                     f"{name} publishes the same joint_states: give each simulator a"

@@ -45,18 +45,21 @@ from sst_ros.scene.yaml_document import read_file, read_values
 
 _DATA_END_SIZE = 9 + 4  # bytes of opcode and length, and of its content
 _HEAD = struct.Struct("<BQ")  # opcode and length, with which each record of MCAP begins
-_PIECE = 1 << 20
+_PIECE = 1 << 20  # bytes read at once to check a file, which may exceed the memory
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _UNFINISHED = ("-wal", "-journal")
 """Files beside a database in which SQLite keeps what a killed process had not yet moved
 into it, or out of it."""
-_STORED = re.compile(r"(.*?)(?:_(\d+))?\.(mcap|db3)(?:\.zstd)?")
+_STORED = re.compile(
+    r"(?P<recording>.*?)(?:_(?P<number>\d+))?\.(?P<storage>mcap|db3)(?:\.zstd)?"
+)
 """Name of a file of a recording: what all of them share, its number, what it is."""
 
-SIMULATOR_NODE, NAMESPACE, CONTROLLER_NODE, EVERYBODY = (
-    "simulator", "namespace", "controller", "everybody"
-)  # fmt: skip
+SIMULATOR_NODE = "simulator"
+NAMESPACE = "namespace"
+CONTROLLER_NODE = "controller"
+EVERYBODY = "everybody"
 
 RawMessage: TypeAlias = tuple[str, str, int, bytes]
 """Topic, type, reception by the recorder [ns], serialized content."""
@@ -82,11 +85,9 @@ class Topic:
 
     def may_be(self, name: str) -> bool:
         """Return whether some run may have it by this full name."""
-        return (
-            name == self.ending
-            if self.owner == EVERYBODY
-            else name.endswith(self.ending)
-        )
+        if self.owner == EVERYBODY:
+            return name == self.ending
+        return name.endswith(self.ending)
 
 
 class Received(NamedTuple):
@@ -123,7 +124,8 @@ class Bag:
         # what is damaged or lost, a line for each part
         self.damage: tuple[str, ...] = ()
         self.unverified = 0  # chunks without a checksum
-        self._requested, self._damaged = requested, damaged
+        self._requested = requested
+        self._damaged = damaged
         self._unreadable: dict[str, InputError] = {}
 
     def messages(self) -> Iterator[Received]:
@@ -202,10 +204,11 @@ class Bag:
         """
         if not self.path.is_dir():
             return [self.path], {}
-        files, counts = list[Path](), dict[str, int]()
-        text = self.path / "metadata.yaml"
+        files = list[Path]()
+        counts = dict[str, int]()
+        metadata_path = self.path / "metadata.yaml"
         try:
-            metadata = read_values(read_file(text), "metadata.yaml")
+            metadata = read_values(read_file(metadata_path), "metadata.yaml")
             metadata = metadata["rosbag2_bagfile_information"]
             files = [
                 self.path / PurePath(name).name
@@ -222,33 +225,34 @@ class Bag:
             AttributeError,
             InputError,
         ) as error:
-            if not self._damaged and (text.exists() or not self._listed()):
+            if not self._damaged and (metadata_path.exists() or not self._list_files()):
                 reason = str(error).removeprefix("metadata.yaml: ")
                 raise self._not_whole(f"metadata.yaml: {reason}") from None
         if not (files and all(map(Path.exists, files))) and (
             self._damaged or not files
         ):
-            files = self._listed()
+            files = self._list_files()
         return files, counts
 
-    def _listed(self) -> list[Path]:
+    def _list_files(self) -> list[Path]:
         """List the files of one recording in the folder.
 
         They are in the order of their numbers.
         """
-        matches = [
-            (match, path) for path in self.path.iterdir() if (match := _name(path))
-        ]
-        recordings = {(match[1], match[3]) for match, _ in matches}
+        matches = list[tuple[re.Match[str], Path]]()
+        for path in self.path.iterdir():
+            match = _split_name(path)
+            if match is not None:
+                matches.append((match, path))
+        recordings = {(match["recording"], match["storage"]) for match, _ in matches}
         if len(recordings) > 1:
             names = ", ".join(sorted(path.name for _, path in matches))
             requirement = (
                 "are files of several recordings, without metadata.yaml: name one file"
             )
             raise refusal(self.path, "bag", names, requirement)
-        return [
-            path for _, path in sorted(matches, key=lambda pair: int(pair[0][2] or 0))
-        ]
+        matches.sort(key=lambda pair: int(pair[0]["number"] or 0))
+        return [path for _, path in matches]
 
     def _read_mcap(self, path: Path, _: Path) -> Iterator[RawMessage]:
         file = McapFile(path)
@@ -285,11 +289,11 @@ class Bag:
                     for key, *channel in topics
                     if self._candidate(*channel)
                 }
-                rows = (
+                query = (
                     "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
                 )
-                rows += f"({','.join('?' * len(chosen))}) ORDER BY timestamp"
-                for key, received_ns, data in database.execute(rows, [*chosen]):
+                query += f"({','.join('?' * len(chosen))}) ORDER BY timestamp"
+                for key, received_ns, data in database.execute(query, [*chosen]):
                     yield *chosen[key], int(received_ns), data
                     count += 1
                 some = database.execute(
@@ -435,7 +439,8 @@ class McapFile:
                 behind = place + _HEAD.size + length
                 if behind > end:
                     damage = Damage(place, "unreadable bytes between chunks")
-                    self.damage += [] if damage in self.damage else [damage]
+                    if damage not in self.damage:  # both kinds of records look here
+                        self.damage.append(damage)
                     break
                 if opcode in opcodes:
                     file.seek(place)
@@ -443,7 +448,7 @@ class McapFile:
                 place = behind
 
     def _parse(self, content: bytes, place: int) -> Sequence[McapRecord]:
-        """Return the record that bytes are; none, and note it, if they are damaged."""
+        """Return the record in some bytes; note them, without one, if damaged."""
         try:
             return [next(_records(content))]
         except Exception as error:  # mcap raises anything on bad bytes
@@ -453,7 +458,7 @@ class McapFile:
     def _read_index(self, file: IO[bytes]) -> tuple[list[McapRecord], int]:
         """Return the records of the index and where it begins.
 
-        None where it is not intact.
+        Where it is not intact there are no records, and zero.
         """
         footer_at = file.seek(0, io.SEEK_END) - FOOTER_SIZE - len(MCAP0_MAGIC)
         file.seek(max(footer_at, 0))
@@ -528,7 +533,7 @@ class McapFile:
     ) -> Sequence[McapRecord]:
         """Return the records in a chunk that comes next.
 
-        None, and note it, if it is damaged.
+        If it is damaged there are none, and the damage is noted.
         """
         self._origin_ns = self._origin_ns or place.begin_ns
         try:
@@ -541,7 +546,8 @@ class McapFile:
             place.reason = "chunk with wrong checksum" if wrong else _one_line(error)
             self.damage.append(place)
             return ()
-        self.unverified += not chunk.uncompressed_crc
+        if not chunk.uncompressed_crc:
+            self.unverified += 1
         return opened
 
     def _check_data(self, file: IO[bytes], end: int) -> None:
@@ -549,7 +555,10 @@ class McapFile:
 
         What lies between its chunks is checked, too.
         """
-        begin, checksum, record = end - _DATA_END_SIZE, file.seek(0), None
+        begin = end - _DATA_END_SIZE
+        checksum = 0
+        record = None
+        file.seek(0)
         while block := file.read(min(_PIECE, begin - file.tell())):
             checksum = zlib.crc32(block, checksum)
         with contextlib.suppress(Exception):  # mcap raises anything on bad bytes
@@ -595,7 +604,7 @@ def _gaps(chunks: Sequence[ChunkIndex], end: int) -> Iterator[tuple[int, int]]:
     yield begin, end - _DATA_END_SIZE
 
 
-def _name(path: Path) -> re.Match[str] | None:
+def _split_name(path: Path) -> re.Match[str] | None:
     """Return the parts of the name of a file of a recording; None for another file."""
     return _STORED.fullmatch(path.name)
 
@@ -612,8 +621,8 @@ def _prepare(path: Path, folder: Path) -> tuple[Path, str]:
         path = target
     with path.open("rb") as file:
         begin = file.read(len(_SQLITE_MAGIC))
-    named = _name(path)
-    is_database = begin == _SQLITE_MAGIC or (named and named[3] == "db3")
+    named = _split_name(path)
+    is_database = begin == _SQLITE_MAGIC or (named and named["storage"] == "db3")
     return path, "db3" if is_database and begin[:8] != MCAP0_MAGIC else "mcap"
 
 

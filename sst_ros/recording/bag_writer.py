@@ -95,7 +95,8 @@ class BagWriter(Writer):
     STORAGE_PLUGINS = {StoragePlugin.MCAP: _McapStorage}  # noqa: RUF012  # as in its base
 
     def __init__(self, path: Path) -> None:
-        self._typestore, self._flushed = message_types(), time.monotonic()
+        self._typestore = message_types()
+        self._flushed = time.monotonic()
         given = "output", str(path), "must be a new folder"
         with refuse_errors("recorder", *given, WriterError, OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -175,21 +176,23 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     if len(files) != 1:
         raise refusal(path, "bag", len(files), "must hold one .mcap file")
-    file, target = McapFile(files[0]), out or path.with_name(f"{path.stem}_recovered")
+    file = McapFile(files[0])
+    target = out or path.with_name(f"{path.stem}_recovered")
     if target.exists():
         raise refusal(target, "bag", str(target), "must be a new folder")
     writer: BagWriter | None = None
     connections: dict[tuple[str, str], Connection] = {}
     unknown = 0
     with refuse_errors(str(path), "bag", str(files[0]), "must be readable", OSError):
-        for topic, encoding, received_ns, data in file.messages():
+        for topic, message_type, received_ns, data in file.messages():
             writer = writer or BagWriter(target)
-            if not writer.knows(encoding):
+            if not writer.knows(message_type):
                 unknown += 1
                 continue
-            if (topic, encoding) not in connections:
-                connections[topic, encoding] = writer.connect(topic, encoding)
-            writer.write(connections[topic, encoding], received_ns, data)
+            key = topic, message_type
+            if key not in connections:
+                connections[key] = writer.connect(topic, message_type)
+            writer.write(connections[key], received_ns, data)
     if writer is None:
         raise refusal(
             path, "bag", files[0].name, "holds no message, or is no MCAP file"

@@ -253,7 +253,8 @@ def read_signals(
     Raises InputError where there is no recording, it is damaged, it has nothing of a
     run, or of several runs none is named.
     """
-    path, tables = Path(path), {table.key: table for table in topics.TOPIC_TABLES}
+    path = Path(path)
+    tables = {table.key: table for table in topics.TOPIC_TABLES}
     requested = [*tables.values(), topics.SCENE_TOPIC, topics.DIAGNOSTICS]
     bag = Bag(path, requested, damaged=damaged)
     heard: dict[str, _Heard] = {}
@@ -268,7 +269,7 @@ def read_signals(
     for key, topic in of_run.items():
         if topic.fault is not None:
             raise refusal(path, key, *topic.fault.args) from None
-        # which others publish on, too
+        # Other robots publish on joint_states, too; on no other topic of a run.
         if topic.foreign and key != topics.JOINT_STATES.key:
             raise refusal(
                 path, key, topic.foreign, "messages have none of the robot's joints"
@@ -290,16 +291,6 @@ def read_signals(
             len(scenes),
             "the recording must hold one scene",
         )
-    stamped = [
-        topic_series[table.key]
-        for table in topics.STAMPED
-        if len(topic_series[table.key])
-    ]
-    starts = [int(series.stamp_ns[0]) for series in stamped]
-    firsts = [
-        int(series.received_ns[0]) for series in topic_series.values() if len(series)
-    ]
-    start_ns = min(starts or firsts)
     origin = f"{path}: {bag.topics.get(topics.SCENE_TOPIC.key)}"
     scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
     reported = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
@@ -309,7 +300,7 @@ def read_signals(
     return Signals(
         bag=bag,
         scene=scene,
-        start_ns=start_ns,
+        start_ns=_find_start(topic_series),
         topic_series=topic_series,
         idle_states=joints.idle,
         foreign_states=joints.foreign,
@@ -317,6 +308,19 @@ def read_signals(
         absent=find_absent(bag, requested, run),
         namespace=run.namespace,
     )
+
+
+def _find_start(topic_series: dict[str, Series]) -> int:
+    """Return the first stamp of a run [ns], or reception where nothing is stamped."""
+    stamped = [
+        topic_series[table.key]
+        for table in topics.STAMPED
+        if len(topic_series[table.key])
+    ]
+    if stamped:
+        return min(int(series.stamp_ns[0]) for series in stamped)
+    received = [series for series in topic_series.values() if len(series)]
+    return min(int(series.received_ns[0]) for series in received)
 
 
 class JointSamples(NamedTuple):
@@ -414,11 +418,12 @@ class Recording(Explained, ReadOnly):
             raise refusal(
                 Path(), "found", found, "must be `Signals`, of `read_signals`"
             )
-        self.signals, self.path, self.table = found, found.bag.path, found.table
+        self.signals = found
+        self.path = found.bag.path
+        self.table = found.table
         absent = found.absent
-        if problems := [
-            absent[topic.key] for topic in ESSENTIAL if topic.key in absent
-        ]:
+        problems = [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]
+        if problems:
             raise InputError(str(self.path), problems)
         if found.scene is None:
             raise refusal(
@@ -427,7 +432,8 @@ class Recording(Explained, ReadOnly):
                 0,
                 "the recording must hold one scene",
             )
-        self.scene, self.idle_states = found.scene, found.idle_states
+        self.scene = found.scene
+        self.idle_states = found.idle_states
         self.foreign_states = found.foreign_states
         self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
         runs = found.statuses_of("run", topics.SCENE_TOPIC.key)
@@ -437,16 +443,11 @@ class Recording(Explained, ReadOnly):
             if "phase" in status.values
         )
         self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
-        joints, truth, orientation, euler, ticks = (
-            _finite_rows(found, table)
-            for table in (
-                topics.JOINT_STATES,
-                topics.TRUE_JOINT_STATES,
-                topics.ORIENTATION_TABLE,
-                topics.EULER,
-                topics.TICK_TABLE,
-            )
-        )
+        joints = _finite_rows(found, topics.JOINT_STATES)
+        truth = _finite_rows(found, topics.TRUE_JOINT_STATES)
+        orientation = _finite_rows(found, topics.ORIENTATION_TABLE)
+        euler = _finite_rows(found, topics.EULER)
+        ticks = _finite_rows(found, topics.TICK_TABLE)
         if len(joints) < 2:
             requirement = (
                 f"a run has two samples or more ({found.idle_states} lie before its"
@@ -465,6 +466,7 @@ class Recording(Explained, ReadOnly):
         self._truth = (
             JointSamples.of(truth, self.start_ns) if shown_samples is truth else None
         )
+        # The attributes that are declared below this function.
         vars(self).update((self._truth or self.measured)._asdict())
         self.quaternion = orientation.at(shown_samples.stamp_ns)
         self.euler = euler.at(shown_samples.stamp_ns)
@@ -475,37 +477,8 @@ class Recording(Explained, ReadOnly):
         if len(wrong):
             requirement = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), requirement)
-        begin_ns = ticks.stamp_ns - self.start_ns
-        end_ns = begin_ns + ticks.values[:, 0].astype(np.int64)
-        overlap = ticks.stamp_ns[1:][begin_ns[1:] < end_ns[:-1]]
-        if len(overlap):
-            requirement = (
-                f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
-            )
-            raise refusal(
-                self.path, topics.TICK_TABLE.key, int(overlap[0]), requirement
-            )
-        moment = ticks.values[:, 4:]
-        has_moment = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
-        self.ticks = Ticks(
-            begin_ns, end_ns, ticks.torque, moment if has_moment else None
-        )
-        command_series = [
-            found.topic_series[table.key]
-            for table in (topics.COMMAND_TABLE, topics.STAMPED_COMMANDS)
-        ]
-        order = np.argsort(
-            np.concatenate([commands.received_ns for commands in command_series]),
-            kind="stable",
-        )
-        names = ("stamp_ns", "received_ns", "values")
-        columns = (
-            np.concatenate([getattr(commands, name) for commands in command_series])[
-                order
-            ]
-            for name in names
-        )
-        self.commands = Series(topics.COMMAND_TABLE.columns, *columns)
+        self.ticks = _read_ticks(self.path, ticks, self.start_ns)
+        self.commands = _merge_commands(found)
         self._freeze()
 
     time_ns: Integers
@@ -605,7 +578,8 @@ class Recording(Explained, ReadOnly):
         return freeze(np.where(index >= 0, largest, np.nan))
 
     def _facts(self) -> dict[str, object]:
-        ticks, reported = self.ticks, self.diagnostics
+        ticks = self.ticks
+        reported = self.diagnostics
         return {
             "path": self.path,
             "scene": self.scene.name,
@@ -647,9 +621,11 @@ class Recording(Explained, ReadOnly):
         samples and torques are lost there is a gap. Its error estimate, method and
         message are those that the simulator reported.
         """
-        has_orientation, ticks = np.isfinite(self.quaternion).all(axis=1), self.ticks
+        has_orientation = np.isfinite(self.quaternion).all(axis=1)
+        ticks = self.ticks
         joints = np.hstack([getattr(self, name) for name in JOINT_QUANTITIES])
-        reported, error_estimate = self.diagnostics, np.nan
+        reported = self.diagnostics
+        error_estimate = np.nan
         with contextlib.suppress(ValueError):
             error_estimate = float(reported.get("error_estimate", "nan"))
         fault = reported.get("fault", "")
@@ -659,11 +635,9 @@ class Recording(Explained, ReadOnly):
             any(begin <= lost_ns < end for begin, end in gaps)
             for lost_ns in lost.tolist()
         ]
-        law = (
-            TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque)
-            if all(inside)
-            else None
-        )
+        law = None
+        if all(inside):
+            law = TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque)
         record = RunRecord(
             status=1 if fault else 0,
             message=fault or reported.get("phase", "recorded"),
@@ -700,6 +674,38 @@ class Recording(Explained, ReadOnly):
         return list(zip(begin[lost].tolist(), end[lost].tolist(), strict=True))
 
 
+def _read_ticks(path: Path, rows: Series, start_ns: int) -> Ticks:
+    """Return the ticks of the rows of their topic; refuse some that overlap."""
+    length_ns = rows.values[:, 0].astype(np.int64)
+    begin_ns = rows.stamp_ns - start_ns
+    end_ns = begin_ns + length_ns
+    overlap = rows.stamp_ns[1:][begin_ns[1:] < end_ns[:-1]]
+    if len(overlap):
+        requirement = (
+            f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
+        )
+        raise refusal(path, topics.TICK_TABLE.key, int(overlap[0]), requirement)
+    moment = rows.values[:, 4:]
+    has_moment = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+    return Ticks(begin_ns, end_ns, rows.torque, moment if has_moment else None)
+
+
+def _merge_commands(signals: Signals) -> Series:
+    """Return the commands of both topics in order of their reception."""
+    plain = signals.topic_series[topics.COMMAND_TABLE.key]
+    stamped = signals.topic_series[topics.STAMPED_COMMANDS.key]
+    received_ns = np.concatenate([plain.received_ns, stamped.received_ns])
+    order = np.argsort(received_ns, kind="stable")
+    stamp_ns = np.concatenate([plain.stamp_ns, stamped.stamp_ns])
+    torques = np.concatenate([plain.values, stamped.values])
+    return Series(
+        topics.COMMAND_TABLE.columns,
+        stamp_ns[order],
+        received_ns[order],
+        torques[order],
+    )
+
+
 def _finite_rows(signals: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
     series = signals.topic_series[table.key]
@@ -721,7 +727,8 @@ def _finite_rows(signals: Signals, table: TopicTable) -> Series:
             signals.bag.path, table.key, f"no {_shorten(absent)}", requirement
         )
     bad = ~finite.all(axis=1)
-    stamp, row = int(series.stamp_ns[bad][0]), series.values[bad][0].tolist()
+    stamp = int(series.stamp_ns[bad][0])
+    row = series.values[bad][0].tolist()
     raise refusal(
         signals.bag.path, table.key, row, f"is not finite at stamp {stamp} ns"
     )
@@ -810,10 +817,8 @@ def export(
     paths = [out / f"{name}.{form}" for name in run.tables]
     with write_into(out, "export"):
         for (name, series), path in zip(run.tables.items(), paths, strict=True):
-            table, columns = (
-                run.table(name).reset_index(),
-                (*topics.TIMES, *series.columns),
-            )
+            table = run.table(name).reset_index()
+            columns = (*topics.TIMES, *series.columns)
             about = {
                 column.name: {"unit": column.unit, "description": column.text}
                 for column in columns

@@ -124,8 +124,10 @@ class RunDiagnostics:
         counters = self._loop.counters
         run, commands, pacer, _ = self._loop.parts
         period = run.period_ns / NANOSECONDS
-        ticks, wall = counters.ticks, counters.wall_s
-        step_mean, step_max = counters.step_mean_s, counters.step_max_s
+        ticks = counters.ticks
+        wall = counters.wall_s
+        step_mean = counters.step_mean_s
+        step_max = counters.step_max_s
         late_mean, late_deviation, late_max = counters.lateness_us
         new_ticks = ticks - self._last.get("ticks", 0)
         new_wall = wall - self._last.get("wall_time_s", 0.0)
@@ -194,7 +196,8 @@ class RunDiagnostics:
         news += [warning for warning in warnings if warning not in self._last_warnings]
         doubts = [*news, *(warning for warning in warnings if warning not in news)]
         missed = values["ticks_missed"] - self._last.get("ticks_missed", 0)
-        self._last, self._last_warnings = values, warnings
+        self._last = values
+        self._last_warnings = warnings
         if values["fault"]:
             return Status(ERROR, values["fault"], news)
         is_running = values["phase"] == Phase.RUNNING.value

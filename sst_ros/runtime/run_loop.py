@@ -61,9 +61,11 @@ class RunLoop(TickLoop):
     def __init__(
         self, scene: Scene, build: Callable[[Scene], Simulation], parts: RunParts
     ) -> None:
-        self.phase, self.fault = Phase.WAITING, ""  # why the run stopped, until a reset
+        self.phase = Phase.WAITING
+        self.fault = ""  # why the run stopped, until a reset
         self.failed = False  # the fault ends the node: nothing is left to wait for
-        self._build, self._original = build, build(scene)
+        self._build = build
+        self._original = build(scene)
         super().__init__(self._original, parts)
         self._requests: deque[tuple[Callable[[], Reply | None], Future[Reply]]] = (
             deque()
@@ -73,9 +75,7 @@ class RunLoop(TickLoop):
     def ask(self, request: Callable[[], Reply]) -> Reply:
         """Have a request (`pause`, `reset`, ...) served by the thread of the run.
 
-        Wait for it.
-
-        The wait ends early where the run has stopped.
+        Wait for its reply; the wait ends early where the run has stopped.
         """
         pending = self.post(request)
         deadline = time.monotonic() + _LONGEST_REPLY_S
@@ -87,9 +87,9 @@ class RunLoop(TickLoop):
         return pending.result()
 
     def post(self, request: Callable[[], Reply | None]) -> Future[Reply]:
-        """Have a request served, which has succeeded where it gives no reply.
+        """Have a request served, without waiting for it.
 
-        Do not wait.
+        It has succeeded where it gives no reply.
         """
         pending: Future[Reply] = Future()
         self._requests.append((request, pending))
@@ -105,13 +105,14 @@ class RunLoop(TickLoop):
         """Run until `stop`, the end of the run, or a fault of a run with a duration."""
         self._missing_since = time.monotonic()
         self._output.publish_phase(self._status)
-        warm, last_shown_s = False, -math.inf
+        is_warm = False
+        last_shown_s = -math.inf
         while not (
             self.stopped.is_set() or self.phase is Phase.FINISHED or self.failed
         ):
             try:
-                if not warm:
-                    warm = True
+                if not is_warm:
+                    is_warm = True
                     self.warm_up()
                 if self.requested.is_set():
                     self._serve()
@@ -233,9 +234,10 @@ class RunLoop(TickLoop):
                     pending.set_result(reply)
 
     def _start(self, waits: bool) -> bool:
-        """Start the run, unless it has to wait, also for a command.
+        """Start the run and return whether it runs.
 
-        Return whether it runs.
+        It has to wait for the subscribers of the parameters, and with `waits` for a
+        command, too.
         """
         if self._missing_since is not None:  # of subscribers that have to be there once
             if missing := self._output.missing_subscribers():

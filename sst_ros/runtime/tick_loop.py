@@ -21,9 +21,11 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import ZERO, State, Vector3
 
 _LONGEST_SLEEP_S = 0.05
-# bounds the ticks that one sleep ends in, so that few commands wait
+"""Longest sleep between two looks at what may interrupt a wait."""
 _TOGETHER_NS = 2_000_000
+"""Bounds the ticks that one sleep ends in, so that few commands wait."""
 _POLL_S = 0.001
+"""Longest sleep between two looks for an answer in lockstep."""
 IDLE_PERIOD_S = 0.1
 """Period in which the state of a run that does not advance is shown."""
 _LOAD_S = 0.02  # loading what has been loaded takes less; then nothing is shown
@@ -32,8 +34,10 @@ _STEP_ANSWER_S = 0.4
 
 Services are answered within 0.5 s.
 """
-_TICKS_AT_ONCE, _AT_ONCE_S = 64, 0.1
-"""Bounds of one call of `Simulation.advance`, after which requests are served."""
+_TICKS_AT_ONCE = 64
+"""Most ticks of one call of `Simulation.advance`, after which requests are served."""
+_AT_ONCE_S = 0.1
+"""Longest time of one call, for the same reason."""
 _LONGEST_WAIT_S = 0.1
 """Longest time that requests wait for the next sample.
 
@@ -71,11 +75,9 @@ class Pacer:
     def __init__(
         self, period_ns: int, speed: float, source: SteadyTime, tolerance_ns: int = 0
     ) -> None:
-        self._period_ns, self._source, self._tolerance_ns = (
-            period_ns,
-            source,
-            tolerance_ns,
-        )
+        self._period_ns = period_ns
+        self._source = source
+        self._tolerance_ns = tolerance_ns
         self._anchor = self._count = self._last_seen_ns = 0
         self._set(speed)
         self.missed = self.overruns = 0  # ticks dropped, and times that some were
@@ -93,7 +95,8 @@ class Pacer:
         self.start()
 
     def _set(self, speed: float) -> None:
-        self.speed, self._interval = speed, self._period_ns / speed if speed else 0.0
+        self.speed = speed
+        self._interval = self._period_ns / speed if speed else 0.0
         self.interval_ns = round(self._interval)  # between deadlines; 0 without any
         # Ticks that one sleep may end in; a clock that is followed does not give the
         # next deadline.
@@ -112,22 +115,24 @@ class Pacer:
     def wait(self, interrupted: Callable[[], bool], ticks: int = 1) -> bool:
         """Wait for the next deadline, or the last of several.
 
-        False if interrupted before.
-
-        That is asked after each sleep, the longest of which is 50 ms.
+        Return False if `interrupted` says so before; it is called after each sleep, the
+        longest of which is 50 ms.
         """
         if self.speed == 0.0:
             self.late_ns = 0
             return not interrupted()
-        due, slept = self._due(ticks), False
+        due = self._due(ticks)
+        slept = False
         while True:
             now_ns = self._source.now_ns()
             if now_ns < self._last_seen_ns:
                 self.jumps += 1
                 self.start()
-                now_ns, due = self._anchor, self._due(ticks)
+                now_ns = self._anchor
+                due = self._due(ticks)
             self._last_seen_ns = now_ns
-            if (late := now_ns - due) >= 0:
+            late = now_ns - due
+            if late >= 0:
                 break
             if slept and interrupted():
                 return False
@@ -151,10 +156,12 @@ class Counters:
 
     def __init__(self) -> None:
         self.ticks = self.published = self.resets = self.states_set = 0
-        self._step_total_s = self.step_max_s = 0.0  # the mean of the steps of one call
-        # that one call may take: one as long as none has been measured
+        # The longest step is that of the call with the longest mean.
+        self._step_total_s = self.step_max_s = 0.0
+        # Ticks that one call may take: one as long as none has been measured.
         self.ticks_at_once = 1
-        self._late_total = self._late_square = self._late_max = 0.0
+        self._late_total = self._late_max = 0.0  # [us]
+        self._late_square = 0.0  # sum of squares [us^2]
         self._wall_s = 0.0
         self._resumed: float | None = None
 
@@ -199,9 +206,9 @@ class Counters:
     @property
     def lateness_us(self) -> tuple[float, float, float]:
         """Mean, standard deviation and largest lateness of the ticks [us]."""
-        mean, square = (
-            x / max(self.ticks, 1) for x in (self._late_total, self._late_square)
-        )
+        ticks = max(self.ticks, 1)
+        mean = self._late_total / ticks
+        square = self._late_square / ticks
         return mean, math.sqrt(max(square - mean * mean, 0.0)), self._late_max
 
 
@@ -224,7 +231,9 @@ class HeldTorques:
     def clear(self) -> None:
         """Forget the torques."""
         self._torques: list[Vector3] = []  # the first two and the last
-        self._impulse, self._seconds, self._changes = ZERO, 0.0, 0
+        self._impulse = ZERO
+        self._seconds = 0.0
+        self._changes = 0
 
     def add(self, torque: Vector3 | SineTorque, seconds: float) -> None:
         """Add torques [N m] that were held for some time [s]; a sine is not held."""
@@ -234,8 +243,12 @@ class HeldTorques:
             self._torques = [*self._torques[:2], torque]
             self._changes += 1
         self._seconds += seconds
-        p, (x, y, z) = self._impulse, torque
-        self._impulse = p[0] + seconds * x, p[1] + seconds * y, p[2] + seconds * z
+        impulse_1, impulse_2, impulse_3 = self._impulse
+        self._impulse = (
+            impulse_1 + seconds * torque[0],
+            impulse_2 + seconds * torque[1],
+            impulse_3 + seconds * torque[2],
+        )
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
         """Return estimated errors of the orientation [rad].
@@ -252,11 +265,10 @@ class HeldTorques:
         drift = axpy(self._changes, second, -self._changes, first)
         lost = add(axpy(1.0, last, -1.0, first), drift)
         # How much the body acceleration changes by a change of the torques.
-        state, dynamics = simulation.state, simulation.dynamics
-        y, other_inputs = (
-            (*state.quaternion, *state.body_rate),
-            (0.0,) * (len(dynamics.drive) - 3),
-        )
+        state = simulation.state
+        dynamics = simulation.dynamics
+        y = (*state.quaternion, *state.body_rate)
+        other_inputs = (0.0,) * (len(dynamics.drive) - 3)
         without, by_late, by_lost = (
             dynamics.derivative(*y, *torque, *other_inputs)[4:7]
             for torque in (ZERO, late, lost)
@@ -284,14 +296,18 @@ class TickLoop:
     def __init__(self, simulation: Simulation, parts: RunParts) -> None:
         self.simulation = simulation  # its `state` may be read by any thread
         self.begun = False  # the first sample has been published
-        self.counters, self.held = Counters(), HeldTorques()
+        self.counters = Counters()
+        self.held = HeldTorques()
         # Set by others to interrupt a wait, or to end.
-        self.requested, self.stopped = threading.Event(), threading.Event()
+        self.requested = threading.Event()
+        self.stopped = threading.Event()
         self.parts = parts
         run, self._input, self._pacer, self._output = parts
         self._run = run
-        self._lockstep, self._last_tick = run.lockstep, run.last_tick
-        self._period_ns, self._ticks_per_sample = run.period_ns, run.ticks_per_sample
+        self._lockstep = run.lockstep
+        self._last_tick = run.last_tick
+        self._period_ns = run.period_ns
+        self._ticks_per_sample = run.ticks_per_sample
         self._control_ns = run.period_ns * run.ticks_per_sample
         self._idle_step_ns = self._control_ns if run.lockstep and run.own_clock else 0
         self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
@@ -334,7 +350,10 @@ class TickLoop:
 
         Stamps go on.
         """
-        self.simulation, self.begun, self._tick, self._kept = simulation, False, 0, None
+        self.simulation = simulation
+        self.begun = False
+        self._tick = 0
+        self._kept = None
         self._input.clear()
         self.held.clear()
         self.show(fault=False)
@@ -364,7 +383,7 @@ class TickLoop:
     def stamp_ns(self, state: State) -> int:
         """ROS time at which a state of the run holds [ns].
 
-        Before it, of the last idle state.
+        Before the run, that of the last idle state.
         """
         return self._start_ns + state.time_ns if self.begun else self._idle_ns
 
@@ -394,7 +413,8 @@ class TickLoop:
         interval_ns = self._pacer.interval_ns if paced and not self._lockstep else 0
         self._waits_since = time.monotonic()
         while True:
-            ticks, unread = self._ticks_left(), 0
+            ticks = self._ticks_left()
+            unread = 0  # samples that nothing receives
             if interval_ns:
                 ticks = min(ticks, self._pacer.together)
             elif paced and not self._lockstep and self._output.unread:
@@ -473,7 +493,8 @@ class TickLoop:
         return min(left, self._last_tick - self._tick, self.counters.ticks_at_once)
 
     def _advance(self, torque: Vector3, ticks: int) -> None:
-        simulation, moment = self.simulation, self._input.moment
+        simulation = self.simulation
+        moment = self._input.moment
         before = simulation.time_ns
         began = time.perf_counter()
         try:

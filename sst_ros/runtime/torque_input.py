@@ -101,7 +101,7 @@ class TorqueInput:
         self.begun = False  # a command has come since the start
         self.stale = False  # the last one is older than command_timeout and not used
         self.last_refusal = ""
-        self._idle_ns = [0, 0]
+        self._idle_ns = [0, 0]  # first and last stamp whose answers are accepted
         self.refresh()
 
     def refresh(self) -> None:
@@ -136,7 +136,10 @@ class TorqueInput:
 
         With `alone`, answers to no other state are accepted.
         """
-        self._idle_ns = [(not alone and self._idle_ns[0]) or stamp_ns, stamp_ns]
+        first_ns = self._idle_ns[0]
+        if alone or first_ns == 0:
+            first_ns = stamp_ns
+        self._idle_ns = [first_ns, stamp_ns]
 
     def starts_run(self) -> bool:
         """Take the messages that arrived before the run.
@@ -153,7 +156,8 @@ class TorqueInput:
         """Return torques [N m] of the tick that begins at this monotonic time [ns]."""
         self._take(now_ns)
         old = self.begun and self._is_old(self._since, now_ns)
-        self.timeouts += old and not self.stale
+        if old and not self.stale:
+            self.timeouts += 1
         self.stale = old
         if not old:
             return self._torque
@@ -232,7 +236,8 @@ class TorqueInput:
 
         Without a frame_id it is taken to be in {B}.
         """
-        frame_id, base_frame = message.header.frame_id, self._run.base_frame
+        frame_id = message.header.frame_id
+        base_frame = self._run.base_frame
         if frame_id not in ("", base_frame):
             reason = (
                 f"external_moment has frame_id {frame_id!r}, must be {base_frame!r} or"
@@ -252,9 +257,11 @@ class TorqueInput:
             self._drop(refused)
             return None
         self._torque = clamp(torque, self._limit)
-        self.clamped += self._torque != torque
+        if self._torque != torque:
+            self.clamped += 1
         self.received += 1
-        self._since, self.begun = now_ns, True
+        self._since = now_ns
+        self.begun = True
         return self._torque
 
     def _drop(self, refused: MessageRefused) -> None:

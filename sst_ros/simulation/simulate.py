@@ -275,7 +275,7 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
     if remembers and task.torque.feedback:
         # The estimate does not see how the controller answers the error.
         factor = _UNSEEN_ANSWER
-    return _trajectory(task, kept, budget.spent, factor=factor)
+    return _make_trajectory(task, kept, budget.spent, factor=factor)
 
 
 def _budget_of(task: Task) -> int:
@@ -287,7 +287,7 @@ def _budget_of(task: Task) -> int:
     return max(WHOLE_MOTION_BUDGET, round(by_duration))
 
 
-def _trajectory(
+def _make_trajectory(
     task: Task, motion: SteppedMotion, spent: int, *, factor: float
 ) -> Trajectory:
     """Return a run as a trajectory.
@@ -298,8 +298,9 @@ def _trajectory(
     error = factor * point.error
     message = motion.message
     if motion.status < 0:
-        numbers = describe_conditioning(Geometry.of(task.scene), motion.state())
-        message = f"{message} ({numbers})"
+        geometry = Geometry.of(task.scene)
+        conditioning_text = describe_conditioning(geometry, motion.state())
+        message = f"{message} ({conditioning_text})"
         if task.period is None and task.torque.feedback:
             message = f"{message}{_ADVICE}"
     status, message = check_error(error, task.tolerance, motion.status, message)
@@ -314,7 +315,8 @@ def _trajectory(
     ]
     law = task.torque
     if motion.held:
-        law = TorqueTable(*zip(*motion.held, strict=True))
+        period_begins, torques = zip(*motion.held, strict=True)
+        law = TorqueTable(period_begins, torques)
     record = RunRecord(
         status=status,
         message=message,
@@ -348,12 +350,16 @@ def _allow_methods(method: object) -> str:
 
 
 def _nanoseconds(name: str, value: float) -> int:
+    # From one nanosecond to what a whole number of 64 bits holds of them.
     if not 1e-9 <= value <= 9e9:
         _refuse(name, value, "must be a number from 1e-9 to 9e9 [s]")
     return round(float(value) * NANOSECONDS)
 
 
-def _read_period(period: float | None, profile: TorqueProfile, span: int) -> int | None:
+def _read_period(
+    period: float | None, profile: TorqueProfile, span_ns: int
+) -> int | None:
+    """Return the control period [ns], None where the torques are not held."""
     if period is None:
         return None
     if not isinstance(profile, FunctionTorque):
@@ -363,8 +369,8 @@ def _read_period(period: float | None, profile: TorqueProfile, span: int) -> int
             "is for a function; give none for numbers and profiles",
         )
     length = _nanoseconds("control_period", period)
-    if span > _MOST_PERIODS * length:
-        least = span / NANOSECONDS / _MOST_PERIODS
+    if span_ns > _MOST_PERIODS * length:
+        least = span_ns / NANOSECONDS / _MOST_PERIODS
         _refuse(
             "control_period",
             period,
@@ -379,7 +385,7 @@ def _read_times(
     """Return the times of the samples [s], in whole nanoseconds."""
     if t_eval is None:
         if samples is None and period is not None:
-            even = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
+            even_ns = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
         else:
             count = _DEFAULT_SAMPLES if samples is None else samples
             if not 1 <= count <= _MOST_SAMPLES:
@@ -388,18 +394,18 @@ def _read_times(
                     samples,
                     f"must be a whole number from 1 to {_MOST_SAMPLES}",
                 )
-            even = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
-        return np.asarray(even / NANOSECONDS)
+            even_ns = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
+        return np.asarray(even_ns / NANOSECONDS)
     if samples is not None:
         _refuse("samples", samples, "must be None where t_eval gives their times")
     times = np.atleast_1d(read_numbers("simulate", "t_eval", t_eval, seconds=True))
     with np.errstate(over="ignore"):
-        rounded = np.rint(times * NANOSECONDS)
+        rounded_ns = np.rint(times * NANOSECONDS)
     if not (
-        rounded.size
-        and ascend(rounded)
-        and rounded[0] >= 0.0
-        and rounded[-1] <= span_ns
+        rounded_ns.size
+        and ascend(rounded_ns)
+        and rounded_ns[0] >= 0.0
+        and rounded_ns[-1] <= span_ns
     ):
         end = span_ns / NANOSECONDS
         _refuse(
@@ -407,4 +413,4 @@ def _read_times(
             t_eval,
             f"must be ascending times from 0 to {end:g} s, a nanosecond apart",
         )
-    return np.asarray(np.abs(rounded) / NANOSECONDS)  # -0.0 is 0.0
+    return np.asarray(np.abs(rounded_ns) / NANOSECONDS)  # -0.0 is 0.0

@@ -248,8 +248,9 @@ class Simulation(Explained):
         constant_torque = finite_vector(torque)
         are_counted = length > 0 and 0 < number <= _MOST_CALL_STEPS
         if constant_torque is None or finite_vector(moment) is None or not are_counted:
-            is_torque = constant_torque is not None or callable(torque)
-            is_torque = is_torque or isinstance(torque, TorqueProfile)
+            # Each argument by itself, to name the one that is refused.
+            is_function = callable(torque) or isinstance(torque, TorqueProfile)
+            is_torque = constant_torque is not None or is_function
             is_moment = finite_vector(moment) is not None
             refuse_unless(
                 "step",
@@ -271,9 +272,11 @@ class Simulation(Explained):
     def _claim(self) -> None:
         """Begin to advance; refuse another thread until `_running` is released."""
         if not self._running.acquire(blocking=False):
-            names = {thread.ident: thread.name for thread in threading.enumerate()}
+            thread_names = {
+                thread.ident: thread.name for thread in threading.enumerate()
+            }
             thread_name = threading.current_thread().name
-            running_name = names.get(self._thread, "another thread")
+            running_name = thread_names.get(self._thread, "another thread")
             requirement = f"must wait: {running_name} advances the simulation"
             raise refusal("step", "thread", thread_name, requirement)
         self._thread = threading.get_ident()
@@ -348,7 +351,8 @@ class Simulation(Explained):
             return self._as_state(self._before)
         start = began / NANOSECONDS
         h = (time_ns - began) / NANOSECONDS
-        _, _, torque, moment = self._current
+        torque = self._current.torque
+        moment = self._current.moment
         point = self._stepper.advance(self._before.point, start, h, torque, moment)
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
@@ -357,6 +361,7 @@ class Simulation(Explained):
         self._claim()
         try:
             self._current = self._before = _Instant(0, self._start)
+            # One assignment of both: other threads may read the state meanwhile.
             self._shown_state = self._current, self._as_state(self._current)
             self._energy = self.dynamics.total_energy(self._start.y)
         finally:
@@ -375,9 +380,11 @@ class Simulation(Explained):
     def state(self) -> State:
         """The last valid state."""
         instant = self._current
-        if self._shown_state[0] is not instant:
-            self._shown_state = instant, self._as_state(instant)
-        return self._shown_state[1]
+        shown_instant, state = self._shown_state
+        if shown_instant is not instant:
+            state = self._as_state(instant)
+            self._shown_state = instant, state
+        return state
 
     @property
     def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
@@ -449,7 +456,8 @@ class Simulation(Explained):
     def energy_residual(self) -> float:
         """Energy now, less that at the start, less work done on the manipulator [J]."""
         y = self._current.point.y
-        return self.dynamics.total_energy(y) - self._energy - y[-1]
+        work = y[-1]
+        return self.dynamics.total_energy(y) - self._energy - work
 
     @property
     def closure_residual(self) -> float:
@@ -487,6 +495,7 @@ class Simulation(Explained):
         )
 
     def _torque(self, instant: _Instant) -> Vector3:
+        # Constant torques act as they are; others are evaluated at the instant.
         if type(instant.torque) is tuple and not self._lags:
             return instant.torque
         return self._stepper.acting(

@@ -106,9 +106,8 @@ class SteppedMotion:
         self._times: list[float] = task.times.tolist()
         self._next = 0  # of the times that are not taken yet
         self._torque: Torque = (0.0, 0.0, 0.0)
-        self._second_torque: Vector3 | None = (
-            None  # on the second solution, where they differ
-        )
+        # on the second solution, where they differ
+        self._second_torque: Vector3 | None = None
         self._segment = task.span
         self._moment = (0.0,) * len(self.stepper.dynamics.drive[3:])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
@@ -125,16 +124,16 @@ class SteppedMotion:
                     self._hold_periods(self._task.period)
         except LimitReached as reached:
             self.status = 1
-            stop = reached.limit.reason
+            reason = reached.limit.reason
             end = math.floor(reached.time * NANOSECONDS) / NANOSECONDS
             self._take_between([end])
             self.time = reached.time
         except CannotStep as error:
             self.status = -1
-            stop = str(error)
+            reason = str(error)
             self._take(self.time, self.point.y)
         if self.status:
-            self.message = f"stopped at t = {self.time:.12f} s: {stop}"
+            self.message = f"stopped at t = {self.time:.12f} s: {reason}"
         return self
 
     def state(self) -> State:
@@ -159,19 +158,19 @@ class SteppedMotion:
     def _hold_periods(self, period: int) -> None:
         """Go through control periods, which hold the torques of a function."""
         task = self._task
-        end = round(task.span[1] * NANOSECONDS)
-        for start in range(0, end, period):
-            time = start / NANOSECONDS
+        end_ns = round(task.span[1] * NANOSECONDS)
+        for start_ns in range(0, end_ns, period):
+            time = start_ns / NANOSECONDS
             self._take_if_wanted(time, self.point.y)
             state = (self.state(),) if task.torque.feedback else ()
             torque = task.torque.at(time, *state)
             self.held.append((time, torque))
             if task.torque.feedback and task.memoryless:
                 self._second_torque = self._answer_second(time)
-            stop = min(start + period, end)
-            self._advance(
-                time, (stop - start) / NANOSECONDS, stop / NANOSECONDS, torque
-            )
+            stop_ns = min(start_ns + period, end_ns)
+            # Not stop less start in seconds: rounding would make periods unequal.
+            length = (stop_ns - start_ns) / NANOSECONDS
+            self._advance(time, length, stop_ns / NANOSECONDS, torque)
 
     def _answer_second(self, time: float) -> Vector3:
         """Return what a function without memory gives to the second solution [N m]."""
@@ -208,8 +207,8 @@ class SteppedMotion:
         self.time = end
         self.point = step.end
         self._take_if_wanted(end, step.end.y)
-        begin, last = self._task.span
-        share = (end - begin) / (last - begin)
+        motion_begin, motion_end = self._task.span
+        share = (end - motion_begin) / (motion_end - motion_begin)
         self._bar.draw(share)
         if self._budget.spent > self._warn_after:
             self._warn_if_hopeless(share)
