@@ -35,9 +35,8 @@ from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_
 from sst_ros.programs.expression import compile_program, trace
 from sst_ros.state import ZERO, Explained, Quaternion, Vector3, find_lost_meaning
 
-ANGLE_ROUNDING = (
-    4e-16  # residual abs(r_k . t_k) at which Newton's method ends: rounding
-)
+# residual abs(r_k . t_k) at which Newton's method ends: rounding
+ANGLE_ROUNDING = 4e-16
 # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
 CLOSED = 1e-14
 _INVERSION_STEPS = 20
@@ -92,7 +91,9 @@ class ReferenceMotion(Explained):
         refuse_unless(
             "motion", ("pieces", pieces, some, "must be rising times [s], a tuple")
         )
-        self._inside, self.pieces, self.duration = inside, pieces, pieces[-1]
+        self._inside = inside
+        self.pieces = pieces
+        self.duration = pieces[-1]
         self.effort = effort
 
     @check_kinds_late
@@ -261,16 +262,12 @@ class ActuatorSpaceMap:
                 sigma = 2.0 / 3.0 * abs(self.posture(*start_quaternion)[-1])
             if step <= continuation.SAFE_STEP * sigma * sigma:
                 quaternion = self._find_orientation(start_quaternion, gamma)
-                # The theorem holds in a ball about R; chords are 2 sqrt(2) sin(angle /
-                # 2).
-                half = math.sqrt(
-                    max(
-                        0.0,
-                        1.0
-                        - sum(map(float.__mul__, quaternion, start_quaternion)) ** 2,
-                    )
-                )
-                if half <= 0.25 * (sigma - step):
+                # The theorem holds in a ball about R, see `continuation.advance`. A
+                # chord is 2 sqrt(2) sin(angle / 2), the radius sqrt(2) (sigma - step)
+                # / 2.
+                cosine = sum(map(float.__mul__, quaternion, start_quaternion))
+                sine = math.sqrt(max(0.0, 1.0 - cosine**2))  # of half the angle
+                if sine <= 0.25 * (sigma - step):
                     return quaternion
         return follow_assembly(self.geometry, start_quaternion, start_gamma, gamma)
 

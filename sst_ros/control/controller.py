@@ -93,7 +93,7 @@ class InverseDynamics(Explained):
             body_acceleration,
             moment if self._has_moment_topic else (),
         )
-        numbers: Any = arguments
+        numbers: Any = arguments  # what is refused where they cannot be unpacked
         with contextlib.suppress(ArithmeticError, TypeError, ValueError, MemoryError):
             numbers = *arguments[0], *arguments[1], *arguments[2], *arguments[3]
             first, second, third, determinant, *squares = self._program(*numbers)
@@ -240,7 +240,10 @@ class InverseDynamics(Explained):
         Raises as `torque` of the first pose that has none.
         """
         count = len(quaternions)
-        at_rest = np.zeros((count, 3 * (3 if self._has_moment_topic else 2)))
+        zeros = 6  # W and W_dot
+        if self._has_moment_topic:
+            zeros = 9
+        at_rest = np.zeros((count, zeros))
         results = self._dynamics.inverse_of_rows(np.hstack([quaternions, at_rest]))
         torques, determinants, squares = np.split(results, [3, 4], axis=1)
         with np.errstate(all="ignore"):  # what is not finite is refused
@@ -282,6 +285,7 @@ class InverseDynamics(Explained):
         finite = False
         refuse_unless("inverse dynamics", ("state", tuple(numbers), not lost, lost))
         with contextlib.suppress(TypeError, ValueError, OverflowError):
+            # quaternion, W and W_dot, and a moment if it comes from a topic
             sizes = len(numbers), len(quaternion)
             finite = sizes in ((10, 4), (13, 4)) and all(map(math.isfinite, numbers))
         short = finite and math.hypot(*quaternion) < 1e-100
@@ -295,15 +299,13 @@ class InverseDynamics(Explained):
         t = geometry.e @ rotation_matrix(quaternion).T
         across = np.cross(t, geometry.w)
         sines = np.linalg.norm(across, axis=1)
-        if (least := float(sines.min())) <= SINGULAR_MASS:
+        least = float(sines.min())
+        if least <= SINGULAR_MASS:
             return SingularConfiguration("serial singularity, sin(mu)", least)
         determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
-        parallel = abs(determinant) <= 2.0 * SINGULAR_MASS
-        cause = (
-            "parallel singularity,"
-            if parallel
-            else "no finite torque gives this acceleration:"
-        )
+        cause = "no finite torque gives this acceleration:"
+        if abs(determinant) <= 2.0 * SINGULAR_MASS:
+            cause = "parallel singularity,"
         return SingularConfiguration(f"{cause} det J2", determinant)
 
 
@@ -329,11 +331,14 @@ class ChannelState:
     """The memory of a channel during a run, with its noise by seed."""
 
     def __init__(self, channel: ControlChannel, seed: int | Sequence[int]) -> None:
-        self._channel, self._random = channel, np.random.default_rng(seed)
+        self._channel = channel
+        self._random = np.random.default_rng(seed)
         self._deviations = np.repeat((channel.angle_noise, channel.rate_noise), 3)
-        self._before: Any = None
-        self._queue: Any = (0.0,) * (3 * channel.delay)
-        self._first = 1.0
+        self._before: Any = None  # angles of the last sample, as encoders count them
+        self._queue: Any = (0.0,) * (
+            3 * channel.delay
+        )  # commands that have not arrived
+        self._first = 1.0  # 0 after the first sample
 
     def measure(self, gamma: Vector3, gamma_dot: Vector3) -> Measurement:
         """Return what the controller receives at a sample.
@@ -379,10 +384,13 @@ class Controller:
         period_s: float,
     ) -> None:
         model = scene_of(model)
-        self._motion, self._settings, self._period_s = motion, settings, period_s
+        self._motion = motion
+        self._settings = settings
+        self._period_s = period_s
         geometry = Geometry.of(model)
         start = motion.at(0.0)
-        self._inverse, self._space = InverseDynamics(model), ActuatorSpaceMap(geometry)
+        self._inverse = InverseDynamics(model)
+        self._space = ActuatorSpaceMap(geometry)
         self._begin = start.quaternion, start.gamma
         rotation = rotation_matrix(start.quaternion)
         posture = virtual_work.posture(geometry, np.array(start.gamma), rotation)
@@ -474,7 +482,8 @@ class Controller:
             for name in ("mode", "space", "torque_limit", "feedforward_at")
         }
         settings = dataclasses.replace(settings, **kept)
-        self._law, self._settings = self._make_law(settings), settings
+        self._law = self._make_law(settings)
+        self._settings = settings
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""
@@ -525,8 +534,9 @@ class Controller:
         """
         if self._failure is not None:
             raise self._failure
-        if lost := "" if type(time) is float else find_lost_meaning(time):
-            refuse_unless("control", ("time", time, False, lost))
+        if type(time) is not float:
+            lost = find_lost_meaning(time)
+            refuse_unless("control", ("time", time, not lost, lost))
         requirement = "must be finite numbers"
         observes = self._settings.observes
         try:
@@ -603,11 +613,17 @@ class TrackingMetrics:
     """
 
     def __init__(self, track: Track | None = None, limited: int | None = None) -> None:
-        self.samples, self.limited = 0, limited
-        self.largest, self.torque_largest, self.last = np.zeros((3, 3))
-        # of error^2, torque^2, feedforward x torque, feedback x it
-        self._sums = np.zeros((4, 3))
-        self._lowest, self._highest = np.full(3, np.inf), np.full(3, -np.inf)
+        self.samples = 0
+        self.limited = limited
+        self.largest = np.zeros(3)
+        self.torque_largest = np.zeros(3)
+        self.last = np.zeros(3)
+        self._error_squares = np.zeros(3)  # sums over the samples
+        self._torque_squares = np.zeros(3)
+        # of feedforward x torque and of feedback x torque
+        self._part_products = np.zeros((2, 3))
+        self._lowest = np.full(3, np.inf)  # desired gamma [rad]
+        self._highest = np.full(3, -np.inf)
         self._rested: float | None = None  # when the motion ended
         # since when the error has been inside the band
         self._settled: float | None = None
@@ -618,13 +634,11 @@ class TrackingMetrics:
         """Add the next part of the record, of one sample or more."""
         error = np.abs(track.error)
         torque = track.torque
-        products = (
-            error**2,
-            torque**2,
-            track.feedforward * torque,
-            track.feedback * torque,
-        )
-        self._sums += [np.sum(product, axis=0) for product in products]
+        self._error_squares += np.sum(error**2, axis=0)
+        self._torque_squares += np.sum(torque**2, axis=0)
+        feedforward_product = np.sum(track.feedforward * torque, axis=0)
+        feedback_product = np.sum(track.feedback * torque, axis=0)
+        self._part_products += [feedforward_product, feedback_product]
         self.largest = np.maximum(self.largest, error.max(axis=0))
         self.torque_largest = np.maximum(
             self.torque_largest, np.abs(torque).max(axis=0)
@@ -635,17 +649,18 @@ class TrackingMetrics:
         self._rested = _since(self._rested, moving, track.time)
         away = moving | (error.max(axis=1) > self.band)
         self._settled = _since(self._settled, away, track.time)
-        self.last, self.samples = error[-1], self.samples + len(error)
+        self.last = error[-1]
+        self.samples += len(error)
 
     @property
     def rms(self) -> Array:
         """Root of the mean square of the error [rad]; 0 without a sample."""
-        return np.asarray(np.sqrt(self._sums[0] / max(self.samples, 1)))
+        return np.asarray(np.sqrt(self._error_squares / max(self.samples, 1)))
 
     @property
     def torque_rms(self) -> Array:
         """Root of the mean square of the torque [N m]; 0 without a sample."""
-        return np.asarray(np.sqrt(self._sums[1] / max(self.samples, 1)))
+        return np.asarray(np.sqrt(self._torque_squares / max(self.samples, 1)))
 
     @property
     def shares(self) -> Array:
@@ -657,7 +672,7 @@ class TrackingMetrics:
         makes their sum differ from 1.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self._sums[2:] / self._sums[1])
+            return np.asarray(self._part_products / self._torque_squares)
 
     @property
     def band(self) -> float:

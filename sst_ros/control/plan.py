@@ -50,7 +50,13 @@ Power is negative where the actuator brakes.
 """
 _GRID = 360  # factors to try
 _FINE_INSTANTS = 33  # instants between two samples beside a peak of a reaction
+# share of a maximum by which another must exceed it: less is rounding
 _LIMIT_ROUNDING = 1e-13
+# places of the first of three, and of det J2, in what `_distances` measures
+_GAMMA = 0
+_SIN_MU = 3
+_BETA = 6
+_DET_J2 = 9
 
 
 @dataclass(frozen=True)
@@ -134,11 +140,10 @@ def examine_motion(
     times = np.concatenate([*piece_times, motion.pieces[-1:]])
     desired = tuple(map(motion.at, times.tolist()))
     distances = tuple(_distances(motion, scene, times, desired, exact))
-    limits = {
-        name: x
-        for name in DEMAND_UNITS
-        for x in values_at(scene, f"actuators.{name}_limit")
-    }
+    limits = {}
+    for name in DEMAND_UNITS:
+        for limit in values_at(scene, f"actuators.{name}_limit"):
+            limits[name] = limit
     inverse = InverseDynamics(scene)
 
     def measure(reference: Reference) -> tuple[float, ...]:
@@ -172,22 +177,32 @@ def examine_motion(
         scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], run=record
     )
     peaks = {}
-    for first, name in zip(range(0, 12, 3), DEMAND_UNITS, strict=True):
+    for place, name in enumerate(DEMAND_UNITS):
+        first = 3 * place  # of the three actuators
         floor = -math.inf if exact else limits.get(name, math.inf)
         legs = range(first, first + 3)
         extremes = (
             [find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs
         )
         peaks[name] = [max(pair, key=lambda peak: abs(peak.value)) for pair in extremes]
-    piece_rows = np.arange(0, len(times) - 1, PIECE_PARTS)[:, None] + np.arange(
-        PIECE_PARTS + 1
-    )
-    squares = simpson(
-        samples[piece_rows, :3] ** 2, x=times[piece_rows][..., None], axis=1
-    ).sum(axis=0)
-    rms = np.sqrt(squares / times[-1]).tolist()
+    rms = _torque_rms(times, samples)
     faults = tuple(_faults(distances, peaks, limits))
     return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
+
+
+def _torque_rms(times: Array, samples: Array) -> list[float]:
+    """Return the root of the mean square of the torques [N m], by leg.
+
+    They are the first three numbers of each sample, shape (n, m). Each piece of the
+    motion has PIECE_PARTS parts, and shares its ends with the next.
+    """
+    first_rows = np.arange(0, len(times) - 1, PIECE_PARTS)
+    piece_rows = first_rows[:, None] + np.arange(PIECE_PARTS + 1)
+    of_pieces = simpson(
+        samples[piece_rows, :3] ** 2, x=times[piece_rows][..., None], axis=1
+    )
+    rms: list[float] = np.sqrt(of_pieces.sum(axis=0) / times[-1]).tolist()
+    return rms
 
 
 def _sample(
@@ -257,6 +272,10 @@ def _distances(
     desired: Sequence[Reference],
     exact: bool,
 ) -> Iterator[LimitDistance]:
+    """Yield the distances of a motion from all limits.
+
+    Raises SingularConfiguration where the motion meets a singularity.
+    """
     geometry = Geometry.of(scene)
     space = ActuatorSpaceMap(geometry)
 
@@ -292,7 +311,10 @@ def _distances(
     edges = [geometry.beta_max] * 3
     in_stroke = scene.stroke.at_end != "ignore"
     in_workspace = scene.workspace.at_edge != "ignore"
-    ranges = ("gamma", 0, arcs, in_stroke), ("beta", 6, edges, in_workspace)
+    ranges = (
+        ("gamma", _GAMMA, arcs, in_stroke),
+        ("beta", _BETA, edges, in_workspace),
+    )
     for name, first, ends, enforced in ranges:
         for leg, most in enumerate(ends):
             for end, sign in ((0.0, 1.0), (most, -1.0)):
@@ -301,17 +323,17 @@ def _distances(
                     f"{name}_{leg + 1}", end, sign, "rad", reached, enforced
                 )
     for leg in (1, 2, 3):
-        low = reach(2 + leg, SINGULAR_MU, 1.0)
+        low = reach(_SIN_MU + leg - 1, SINGULAR_MU, 1.0)
         if low.value < SINGULAR_MU:
             cause = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(cause, low.value)
         yield LimitDistance(f"sin(mu_{leg})", 0.0, 1.0, "1", low, True)
 
     def determinant(time: float) -> float:
-        return measure(motion.at(time))[9]
+        return measure(motion.at(time))[_DET_J2]
 
-    sign = math.copysign(1.0, samples[0, 9])
-    nearest = reach(9, sign * SINGULAR_J2, sign)
+    sign = math.copysign(1.0, samples[0, _DET_J2])
+    nearest = reach(_DET_J2, sign * SINGULAR_J2, sign)
     if sign * nearest.value < SINGULAR_J2:
         crosses = sign * nearest.value <= 0.0
         time = brentq(determinant, 0.0, nearest.time) if crosses else nearest.time
@@ -484,11 +506,15 @@ def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
     Each row is held for a period [s], and has the torques of its middle. The last row
     holds the manipulator where the motion ends.
     """
-    inverse, motion = InverseDynamics(plan.trajectory.scene), plan.motion
+    inverse = InverseDynamics(plan.trajectory.scene)
+    motion = plan.motion
     count = math.ceil(motion.duration / period - 1e-9)
     lines = ["time,tau_1,tau_2,tau_3"]
     for k in range(count + 1):
-        reference = motion.at((k + 0.5) * period if k < count else math.inf)
+        middle = (k + 0.5) * period
+        if k == count:
+            middle = math.inf
+        reference = motion.at(middle)
         lines.append(
             ",".join(map(repr, (k * period, *inverse.reference_torque(reference))))
         )

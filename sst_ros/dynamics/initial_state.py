@@ -81,6 +81,7 @@ def initial_states(
     codes = np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64)
     for first in range(0, len(gamma), BLOCK):
         block = slice(first, first + BLOCK)
+        # Equal starts, a geometry and its gamma, are solved once.
         starts = np.column_stack([geometry_index[block], gamma[block]])
         distinct, index = np.unique(starts, axis=0, return_inverse=True)
         index = index.ravel()
@@ -153,13 +154,17 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
     for name in ("gravity", "friction", "springs", "own_loads"):
         term = getattr(scene, name)
         checks.append((name, term, not term, requirement))
-    lag = scene.actuators and scene.actuators.time_constant
+    lag = None
+    if scene.actuators is not None:
+        lag = scene.actuators.time_constant
     checks.append(("actuators.time_constant", lag, not scene.lags, requirement))
     at_end = scene.stroke.at_end
     checks.append(("stroke.at_end", at_end, at_end != "elastic", requirement))
     refuse_unless(scene.name, *checks)
     mechanism = virtual_work.Mechanism.of(scene)
-    constant = np.array((scene.moment and scene.moment.value) or ZERO)
+    constant = np.array(ZERO)
+    if scene.moment is not None and scene.moment.value is not None:
+        constant = np.array(scene.moment.value)
 
     def derivative(_time: float, *inputs: float) -> tuple[float, ...]:
         x, y, z, w, wx, wy, wz, _work, *drive = inputs

@@ -154,16 +154,23 @@ def balance(
     jacobian = []
     for k, (leg, drive) in enumerate(zip(model.legs, torque, strict=True)):
         motion = leg_motion(leg, rows, rate)
-        a, a_dot, gamma_dot = motion.a, motion.a_dot, motion.gamma_dot
-        p, u, g = motion.p, motion.u, motion.g
+        a = motion.a
+        a_dot = motion.a_dot
+        gamma_dot = motion.gamma_dot
+        p = motion.p
+        u = motion.u
+        g = motion.g
         jacobian.append(g)
         a_rest, gamma_rest = rest_accelerations(motion, rate)
         # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
-        a_inertia, a_slope = leg.a0 + leg.a2 * (a * a), 2.0 * leg.a2 * a
-        c_inertia, c_slope = 0.0, 0.0
+        a_inertia = leg.a0 + leg.a2 * (a * a)
+        a_slope = 2.0 * leg.a2 * a
+        c_inertia = 0.0
+        c_slope = 0.0
         if leg.ixy or leg.ixz or leg.iyz:
             root = sqrt(u)
-            c_inertia, c_slope = leg.ixz * a / root - leg.ixy, leg.ixz / (u * root)
+            c_inertia = leg.ixz * a / root - leg.ixy
+            c_slope = leg.ixz / (u * root)
             a_inertia = a_inertia - 2.0 * leg.iyz * a * root
             a_slope = a_slope - 2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
         force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
@@ -171,14 +178,13 @@ def balance(
         force_gamma = (
             force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
         )
-        toward_a, toward_gamma = (
-            multiply(c_inertia, g),
-            axpy(a_inertia, g, c_inertia, p),
-        )
+        toward_a = multiply(c_inertia, g)
+        toward_gamma = axpy(a_inertia, g, c_inertia, p)
         at_gamma, at_mu, at_beta = joint_torques(motion, field)
         if own is not None:
             at_gamma, at_mu, at_beta = add((at_gamma, at_mu, at_beta), own.joints[k])
         force_gamma = force_gamma - at_gamma
+        # Python's 0.0 is no load at mu: then no square root is traced for it.
         if not (type(at_mu) is float and at_mu == 0.0):
             force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
         force = triple(f + at_beta * b for f, b in zip(force, motion.b, strict=True))
@@ -273,7 +279,8 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
     total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
     for motion in leg_motions(model, state):
-        leg, own = motion.leg, 0.0
+        leg = motion.leg
+        own = 0.0
         for joint, spring in enumerate(leg.springs):
             if spring is not None:
                 stretch = joint_angle(motion, joint) - spring.rest
@@ -311,7 +318,8 @@ def power(
     total: Scalar = 0.0
     for motion, drive in zip(leg_motions(model, state), acting, strict=True):
         total = total + drive * motion.gamma_dot
-        leg, lost = motion.leg, 0.0
+        leg = motion.leg
+        lost = 0.0
         for joint, friction in enumerate(leg.friction):
             if friction is not None:
                 lost = lost + friction_torque(
@@ -348,14 +356,17 @@ def joint_torques(motion: LegMotion, field: Triple) -> Triple:
     leg = motion.leg
     torques = []
     for joint in range(3):
-        rubbing, restoring = 0.0, 0.0
-        friction, spring = leg.friction[joint], leg.springs[joint]
+        rubbing = 0.0
+        restoring = 0.0
+        friction = leg.friction[joint]
+        spring = leg.springs[joint]
         if friction is not None:
             rubbing = -friction_torque(friction, joint_rate(motion, joint))
         if spring is not None:
             restoring = -spring.stiffness * (joint_angle(motion, joint) - spring.rest)
         torques.append(rubbing + restoring)
-    at_gamma, at_mu = 0.0, 0.0
+    at_gamma = 0.0
+    at_mu = 0.0
     if any(leg.drive) or any(leg.link):  # weight: moments about w_k and -r_k
         of_drive, of_link = _directions(motion)
         on_link = cross3(_combine(leg.link, *of_link), field)
@@ -387,7 +398,7 @@ def own_torques(model: Model, rows: Rows, rate: Triple) -> OwnTorques:
         if load.formula.moment:
             star = add(star, _own_moment(load, rows, rate, legs))
             continue
-        _, *slopes = _run_load(load, rows, rate, legs)
+        _potential, *slopes = _run_load(load, rows, rate, legs)
         names = load_program(load.formula).quantities
         by_name = dict(zip(names, slopes, strict=True))
         for i, row in enumerate(rows, start=1):
@@ -458,7 +469,9 @@ def joint_rate(motion: LegMotion, joint: int) -> Scalar:
     """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
     if joint == 0:
         return motion.gamma_dot
-    return -motion.a_dot / sqrt(motion.u) if joint == 1 else motion.beta_dot
+    if joint == 1:
+        return -motion.a_dot / sqrt(motion.u)
+    return motion.beta_dot
 
 
 def joint_angle(motion: LegMotion, joint: int) -> Scalar:
@@ -488,4 +501,5 @@ def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
 
 
 def _combine(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
+    """Return the vector with the components c along the axes x, y and z."""
     return triple(c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))

@@ -24,9 +24,10 @@ SINGULAR_MU = 1e-6
 CONTACT_BAND = 1e-9
 # a distance below this [rad] counts as zero: closure and rounding reach 1e-15
 GRAZING = 1e-12
-_WIDTH = 2.0
-"""Of v / smoothing, that a step may pass at most. tanh has its poles at pi / 2 from the
-real axis: steps of this width converge with the order of their method."""
+_STEP_WIDTH = 2.0
+"""Largest change of v / smoothing in a step. Its tanh has poles at pi / 2 from the real
+axis: steps of this width converge with the order of their method.
+"""
 _INVERSE_LANGEVIN_SERIES = (
     3.0,
     9 / 5,
@@ -255,9 +256,11 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
     ranges: dict[int, tuple[float, float]] = {}
     for limit in limits:
         low, high = ranges.get(limit.joint, (-math.inf, math.inf))
-        ranges[limit.joint] = (
-            (limit.end, high) if limit.sign > 0.0 else (low, limit.end)
-        )
+        if limit.sign > 0.0:
+            low = limit.end
+        else:
+            high = limit.end
+        ranges[limit.joint] = (low, high)
     return [(joint, low, high) for joint, (low, high) in ranges.items()]
 
 
@@ -268,9 +271,9 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
     """
 
     def above(name: str, end: Any) -> str:
-        return (
-            f"{name} > {end:.6f} rad" if isinstance(end, float) else f"{name} > its end"
-        )
+        if isinstance(end, float):
+            return f"{name} > {end:.6f} rad"
+        return f"{name} > its end"
 
     for k in range(3):
         singular = f"serial singularity, mu_{k + 1}"
@@ -302,6 +305,7 @@ def contact_events_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
 
 def free_range(events: Sequence[Limit]) -> list[Limit]:
     """Return limits of the range in which no elastic stop can be in contact."""
+    # Of the two events at each end: the one whose distance is positive inside.
     inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
     return [
         event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign)
@@ -327,15 +331,14 @@ def transitions_of(scene: Any, tolerance: float) -> tuple[Transition, ...]:
     if scene.friction is None or edge == 0.0:
         return ()
     frictions = scene.friction.gamma, scene.friction.mu, scene.friction.beta
-    return tuple(
-        Transition(
-            9 + 3 * place + leg,
-            edge * friction.smoothing,
-            _WIDTH * friction.smoothing,
-        )
-        for place, friction in enumerate(frictions)
-        if friction is not None
-        and (friction.coulomb or friction.static)
-        and _WIDTH * friction.smoothing >= _RESOLVED * tolerance
-        for leg in range(3)
-    )
+    transitions = []
+    for place, friction in enumerate(frictions):
+        if friction is None or not (friction.coulomb or friction.static):
+            continue
+        width = _STEP_WIDTH * friction.smoothing
+        if width < _RESOLVED * tolerance:
+            continue
+        for leg in range(3):
+            rate = 9 + 3 * place + leg  # the rates follow nine angles
+            transitions.append(Transition(rate, edge * friction.smoothing, width))
+    return tuple(transitions)

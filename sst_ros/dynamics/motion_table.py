@@ -35,10 +35,8 @@ def _of_joints(name: str, meaning: str) -> Any:
 class MotionTable(Explained, ReadOnly):
     """Quantities of a motion at n instants, of N scenarios, or of both, (n, N).
 
-    read-only.
-
-    In shapes, ... is that of t. A `Trajectory` is one motion, a `BatchResult` many
-    scenarios.
+    In shapes, ... is that of t. Arrays are read-only. A `Trajectory` is one motion, a
+    `BatchResult` many scenarios.
 
     Attributes:
         scene: what moves.
@@ -119,12 +117,14 @@ class MotionTable(Explained, ReadOnly):
 
         Needs xarray.
         """
-        axes, arrays = self._axes, dict[str, Any]()
+        axes = self._axes
+        arrays: dict[str, Any] = {}
         for name, (unit, dimension) in QUANTITIES.items():
             arrays[name] = (*axes, dimension), getattr(self, name), {"units": unit}
         arrays["energy"] = axes, self.energy, {"units": "J"}
         for name, (values, unit) in self._of_each().items():
-            arrays[name] = "scenario", np.array(values), {"units": unit} if unit else {}
+            attributes = {"units": unit} if unit else {}
+            arrays[name] = "scenario", np.array(values), attributes
         time = {"units": "s"}
         if "scenario" in axes:
             arrays["t"] = axes, self.t, time

@@ -180,11 +180,9 @@ def _step(x: Any) -> Any:
     """Return 1 where x > 0 and 0 elsewhere: the slope of `positive`."""
     if hasattr(x, "apply"):
         return x.apply("step")
-    return (
-        np.where(np.real(x) > 0, 1.0, 0.0)
-        if isinstance(x, np.ndarray)
-        else float(x > 0)
-    )
+    if isinstance(x, np.ndarray):
+        return np.where(np.real(x) > 0, 1.0, 0.0)
+    return float(x > 0)
 
 
 _STEP_FUNCTIONS: dict[str, Callable[..., Any]] = {

@@ -290,6 +290,7 @@ class ODE:
         Raises ArithmeticError where it is not finite.
         """
         size = len(self.state)
+        # The derivative and its slopes by t come first, then those by the state.
         flat = np.array(self.linearised(t, *y, *d)[2 * size :])
         if not np.isfinite(flat).all():
             raise ArithmeticError("the Jacobian is not finite")
@@ -539,18 +540,17 @@ class ParametricModel:
     def _constants_of(
         self, scenarios: Scenarios
     ) -> tuple[Constants, Geometry, NDArray[np.intp]]:
-        """Return constants of scenarios, as columns.
+        """Return constants of scenarios, as columns, and their distinct geometries.
 
-        Geometries, and that of each row.
+        The last of the three is the index of the geometry of each row.
         """
         geometries, geometry_index = Geometry.of_scenarios(scenarios)
         geometry = geometries.of_rows(geometry_index)
         columns = scenarios.columns()
         limits = limits_of(self.scene, geometry)
         ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
-        with np.errstate(
-            invalid="ignore"
-        ):  # 0/0: the rest of springs without stiffness
+        # 0/0: the rest of springs without stiffness
+        with np.errstate(invalid="ignore"):
             model = kernel.model_of(columns, geometry)
         torque = columns.torque if self.profile else None
         return Constants(model, ends, torque), geometries, geometry_index

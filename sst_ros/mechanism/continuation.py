@@ -126,7 +126,8 @@ def advance(
         # assembly.
         if np.linalg.norm(moved - current) > SQRT2 * (sigma - step) / 2.0:
             break
-        gamma, current = following, moved
+        gamma = following
+        current = moved
     raise BranchEnds(sigma, row, gamma, current, slope)
 
 
@@ -144,13 +145,15 @@ def _slope(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
 def _newton(geometry: Geometry, gamma: Array, rotation: Array) -> Array:
     """Return the best iterate R of Newton's method at gamma, shape (3, 3)."""
     r = kinematics.carriage_directions(geometry, gamma)
-    best, least = rotation, np.inf
+    best = rotation
+    least = np.inf  # residual of `best`
     for _ in range(ITERATIONS):
         t = geometry.e @ rotation.T
         residual = np.sum(r * t, axis=1)
         largest = float(np.abs(residual).max())
         if largest < least:
-            best, least = rotation, largest
+            best = rotation
+            least = largest
         if largest < CLOSURE_ROUNDING:
             break
         rotation = rotate(rotation, np.linalg.solve(cross(t, r), -residual))

@@ -69,7 +69,7 @@ class Geometry(Explained):
     @classmethod
     def of(cls, scene: Any) -> Geometry:
         """Derive the geometry of a `Scene`."""
-        if not hasattr(scene, "star"):  # nor has its class
+        if not hasattr(scene, "star"):  # the class `Scene` itself has none either
             refuse_unless("geometry", ("scene", scene, False, "must be a Scene"))
         return _recent(scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg)
 
@@ -260,7 +260,8 @@ def _nearest_form(angles: Array, reference: Array) -> Array:
         half_turn = 0.0
         shift = reference[0] - theta
         theta = reference[0]
-        psi = psi + shift if phi else psi - shift
+        # Kept is theta + psi at phi = 0, theta - psi at phi = pi.
+        psi = psi - shift if phi == 0.0 else psi + shift
     forms = np.array([[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]])
     forms += 2.0 * np.pi * np.round((reference - forms) / (2.0 * np.pi))
     return np.asarray(forms[np.argmin(np.abs(forms - reference).sum(axis=1))])

@@ -243,12 +243,12 @@ def admissible_rotations(geometry: Geometry, gamma: ArrayLike) -> Array:
     """
     angles = np.asarray(gamma, dtype=float)
     for row in np.flatnonzero(~np.isfinite(angles).all(axis=1)):
-        admissible(geometry, angles[row])
+        admissible(geometry, angles[row])  # raises the error
     assemblies = direct_many(geometry, angles)
     owners = assemblies.configuration[assemblies.admissible]
     counts = np.bincount(owners, minlength=len(angles))
     for row in np.flatnonzero((counts != 1) | ~assemblies.isolated):
-        admissible(geometry, angles[row])
+        admissible(geometry, angles[row])  # raises the error
     return assemblies.rotation[assemblies.admissible]
 
 
@@ -265,6 +265,7 @@ def describe_assemblies(
     mu = np.arctan2(dot(cross(t, geometry.w), r), dot(geometry.w, t))
     beta = np.arctan2(dot(r, cross(t, s)), dot(r, s))
     first, second, third = np.moveaxis(cross(r, t), -2, 0)
+    # J2 has the rows t_k x r_k = -(r_k x t_k).
     det_j2 = -dot(first, cross(second, third))
     is_on_triangle = dot(np.broadcast_to(s, t.shape), geometry.w) > 0.0
     beta_max = np.asarray(geometry.beta_max)[..., None]
@@ -288,8 +289,8 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     along_m = (directions @ m[:, :, None])[..., 0]
     along_r = (directions @ r_1[:, :, None])[..., 0]
     e_x, e_y = e[..., 1:, 0], e[..., 1:, 1]
-    # Of legs 2 and 3: coefficients of (cos x, sin x) in a and c, shape (n, 2, 2), and
-    # the number b, (n, 2).
+    # For each configuration and legs 2 and 3: two coefficients, of cos x and sin x, in
+    # a and c; one number in b.
     a = e_x[..., None] * np.stack([-along_m, along_n], axis=-1)
     b = -e_x * along_r
     c = e_y[..., None] * np.stack([along_n, along_m], axis=-1)
@@ -330,6 +331,7 @@ def _quartic(a: Array, b: Array, c: Array) -> Array:
     sine = _product(c_2, a_3) - _product(a_2, c_3)
     form = _product(sine, sine)
     quadratic = _product(cosine, cosine) - _product(scale, scale)
+    # The quadratic form becomes one of degree four by the factor cos^2 x + sin^2 x = 1.
     form[:, :3] += quadratic  # times cos^2 x
     form[:, 2:] += quadratic  # times sin^2 x
     return form
@@ -350,10 +352,12 @@ def _turn_forms(count: int) -> tuple[Array, Array]:
     for turn, angle in enumerate(angles):
         cosine, sine = np.cos(angle), np.sin(angle)
         for power in range(5):
-            factors = [[cosine, -sine]] * (4 - power) + [[sine, cosine]] * power
+            # cos^(4 - power) x sin^power x, each factor by cosine and sine of x - x_0
             term = np.ones(1)
-            for factor in factors:
-                term = np.convolve(term, factor)
+            for _ in range(4 - power):
+                term = np.convolve(term, [cosine, -sine])
+            for _ in range(power):
+                term = np.convolve(term, [sine, cosine])
             matrices[turn, :, power] = term
     return angles, matrices
 
@@ -475,6 +479,7 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
     if not len(owner):
         return owner, rotation
     fresh = np.ones(len(owner), dtype=bool)
+    # A configuration has at most eight starts: four angles x with two angles y each.
     for back in range(1, 8):
         later = np.arange(back, len(owner))
         later = later[(owner[later] == owner[later - back]) & fresh[later]]

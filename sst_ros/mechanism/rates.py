@@ -59,7 +59,7 @@ def of_actuators(
     acceleration = np.array(gamma_ddot, dtype=float)
     omega = at.j @ rate
     omega_dot = at.j @ acceleration + virtual_work.bias(at, rate).omega_dot
-    return _motion(at.r, at.t, at.w, omega, omega_dot, rate, acceleration)
+    return _motion(at.r, at.t, at.w, omega, omega_dot, (rate, acceleration))
 
 
 def of_star(
@@ -117,11 +117,16 @@ def body_rates(
 
 
 def _motion(
-    r: Array, t: Array, w: Array, omega: Array, omega_dot: Array, *actuators: Array
+    r: Array,
+    t: Array,
+    w: Array,
+    omega: Array,
+    omega_dot: Array,
+    actuators: tuple[Array, Array] | None = None,
 ) -> BodyRates:
     """Return the motion of all joints and links.
 
-    gamma_dot and gamma_ddot are those of `actuators` where they are known.
+    Where gamma_dot and gamma_ddot are known, they are given as `actuators`.
     """
     normal = cross(r, t)
     wr = cross(w, r)
@@ -131,13 +136,13 @@ def _motion(
     mu_dot = -(r @ omega)  # Eq. 18
     beta_dot = -(wr @ omega) / c  # Eq. 21
     product = gamma_dot * mu_dot
-    along_normal = product * np.sum(normal * wr, axis=1)
-    turned = beta_dot * np.sum(normal * t_dot, axis=1)
-    gamma_ddot = (normal @ omega_dot + along_normal + turned) / c  # Eq. 29
+    of_product = product * np.sum(normal * wr, axis=1)
+    of_t_dot = beta_dot * np.sum(normal * t_dot, axis=1)
+    gamma_ddot = (normal @ omega_dot + of_product + of_t_dot) / c  # Eq. 29
     mu_ddot = -(r @ omega_dot) - beta_dot * np.sum(r * t_dot, axis=1)  # Eq. 42
-    turned = beta_dot * np.sum(wr * t_dot, axis=1)
-    beta_ddot = -(wr @ omega_dot + product + turned) / c  # Eq. 46
-    if actuators:
+    across_t_dot = beta_dot * np.sum(wr * t_dot, axis=1)
+    beta_ddot = -(wr @ omega_dot + product + across_t_dot) / c  # Eq. 46
+    if actuators is not None:
         gamma_dot, gamma_ddot = actuators
     zero = np.zeros(3)
     x = np.array([1.0, 0.0, 0.0])
@@ -222,17 +227,19 @@ def orientation_sensitivity(
         by_gamma[..., k, k] = _dot(np.cross(w[k], r_k), t_k)
         for leg in (k, following):
             for axis in range(3):
-                moved = np.eye(3)[axis] - v[leg] * v[leg][axis]  # of a unit vector
+                # v stays a unit vector: its change is across itself.
+                moved_v = np.eye(3)[axis] - v[leg] * v[leg][axis]
                 if leg == k:
-                    along = moved
-                    normal = cross(moved, v[following])
+                    moved_v_k = moved_v
+                    moved_normal = cross(moved_v, v[following])
                 else:
-                    along = np.zeros(3)
-                    normal = cross(v[k], moved)
-                normal = (normal - w[k] * (w[k] @ normal)) / np.sin(geometry.arc[k])
-                across = cross(normal, v[k]) + cross(w[k], along)
-                change = cosine * along + sine * across
-                by_v[..., k, leg, axis] = _dot(change, t_k)
+                    moved_v_k = np.zeros(3)
+                    moved_normal = cross(v[k], moved_v)
+                across_w = moved_normal - w[k] * (w[k] @ moved_normal)
+                moved_w = across_w / np.sin(geometry.arc[k])
+                moved_across = cross(moved_w, v[k]) + cross(w[k], moved_v_k)
+                moved_r = cosine * moved_v_k + sine * moved_across
+                by_v[..., k, leg, axis] = _dot(moved_r, t_k)
         e_slope = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
         by_turn = _dot(r_k, matrix @ e_slope)
         by_alpha[..., k, :k] = by_turn[..., None]

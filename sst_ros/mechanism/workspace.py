@@ -197,7 +197,7 @@ def over_orientations(
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         measured.append(measures(geometry, gamma, rotation))
-    by_name = zip(*(vars(block).values() for block in measured), strict=True)
+    by_name = zip(*(vars(part).values() for part in measured), strict=True)
     joined = Measures(*map(np.concatenate, by_name))
     frozen(directions, psi, *vars(joined).values())
     return OrientationMap(geometry, directions, psi, joined)
@@ -236,6 +236,7 @@ def triangle_directions(
     upward = corner, right, above
     downward = corner, below, right
     faces = np.stack([upward, downward], axis=-1).reshape(3, -1).T
+    # 0.1 of a step more for each corner keeps all directions off the edges.
     weights = np.column_stack([i, j, divisions - i - j]) + 0.1
     s = weights @ geometry.v
     inside = np.asarray(faces[faces.min(axis=1) >= 0], dtype=np.intp)
@@ -265,7 +266,8 @@ def parallel_singularities(chart: OrientationMap) -> SingularPoses:
     The poses fill a surface in (s, psi); the resolution of the map sets how many points
     of it are found. Each is exact to rounding.
     """
-    geometry, measured = chart.geometry, chart.measures
+    geometry = chart.geometry
+    measured = chart.measures
     following = np.roll(np.arange(len(chart.psi)), -1)
     signs = np.sign(measured.det_j2)
     changes = signs * signs[:, following] < 0

@@ -83,7 +83,7 @@ def compile_rows(programs: Mapping[str, Program], name: str) -> RowsFunction:
 
     def compute(rows: Array) -> Array:
         count = len(rows)
-        width = -(-count // LANES) * LANES
+        width = -(-count // LANES) * LANES  # the next multiple
         inputs = np.empty((columns.rows, width))
         inputs[:, :count] = rows.T
         inputs[:, count:] = inputs[:, :1]  # any numbers do: their results are not read

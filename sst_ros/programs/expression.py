@@ -82,7 +82,7 @@ _SLOPE_RULES: dict[str, Callable[..., Value]] = {
 }
 """Slopes of f = f(x, y), whose arguments have the slopes dx and dy.
 
-Of f(x) without dx.
+Those of f(x) are by x: `_slopes_of` multiplies them by dx.
 """
 
 
@@ -120,6 +120,8 @@ class Graph:
 
     def node(self, op: Operation, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
+        # A node ("n") is never equal to a constant ("c"); sums and products are the
+        # same in either order.
         keys = [
             ("n", a.index) if isinstance(a, Expression) else ("c", _origin(a))
             for a in args
@@ -143,7 +145,9 @@ class Expression:
     __array_ufunc__ = None
 
     def __init__(self, graph: Graph, index: int, *, is_present: bool = False) -> None:
-        self.graph, self.index, self.is_present = graph, index, is_present
+        self.graph = graph
+        self.index = index
+        self.is_present = is_present
 
     def __add__(self, operand: Value) -> Value:
         if _is(operand, 0.0):
@@ -217,8 +221,9 @@ class Expression:
 
 def mark_present(value: Any) -> Any:
     """Return an expression that counts as not zero: no term of it is left out."""
-    is_traced = isinstance(value, Expression)
-    return Expression(value.graph, value.index, is_present=True) if is_traced else value
+    if not isinstance(value, Expression):
+        return value
+    return Expression(value.graph, value.index, is_present=True)
 
 
 def _folds(

@@ -105,6 +105,7 @@ class RowFunction:
         signature = ctypes.CFUNCTYPE(None, ctypes.c_int64, *(pointer,) * 4)
         self._call = signature(code.address(row_name(name, shared)))
         self._code = code
+        # one more, so that the array is never empty
         self._numbers = np.array([*module.numbers, 0.0])
         self._numbers_address = self._numbers.ctypes.data
 

@@ -54,12 +54,10 @@ def write_text(
 
     """
     slots = Slots()
-    wide = {
-        called
-        for row in rows
-        for routine in programs[row].routines
-        for called in _reach(programs, routine.name)
-    }
+    wide: set[str] = set()  # programs that rows call
+    for row in rows:
+        for routine in programs[row].routines:
+            wide |= _reach(programs, routine.name)
     narrow = set() if rows else set(programs)
     widths = sorted({1, lanes})
     sections = [_declare(widths)]
@@ -159,7 +157,11 @@ def _write_function(
     for number, output in enumerate(program.outputs):
         writer.store(writer.operand_text(output), "%o", number)
     array = f"{_pointer(_type_of(width))} noalias"
-    linkage, attribute = ("internal ", " alwaysinline") if inline else ("", "")
+    linkage = ""
+    attribute = ""
+    if inline:
+        linkage = "internal "
+        attribute = " alwaysinline"
     head = f"define {linkage}void {_function_name(name, width)}"
     head += f"({array} %x, double* noalias %p, {array} %o){attribute} {{"
     return "\n".join([head, *writer.first_lines, *writer.lines, "  ret void", "}", ""])
@@ -179,7 +181,7 @@ def _write_tanh(width: int) -> str:
 
 
 class _Writer:
-    """Lines of one function; `first_lines` are those at its begin."""
+    """Lines of one function; `first_lines` are those at its beginning."""
 
     def __init__(self, program: Program, slots: Slots, width: int) -> None:
         self._slots = slots
@@ -334,7 +336,7 @@ class _Writer:
         return name
 
     def _number(self, slot: int) -> str:
-        """Load a number of the scene, at the begin of the function, once."""
+        """Load a number of the scene, at the beginning of the function, once."""
         if slot not in self._numbers:
             name = f"%n{slot}"
             if self._width == 1:
@@ -405,6 +407,9 @@ def _write_loop(
 
     `ins` and `outs` are arrays of addresses of rows; n is a multiple of the lanes. The
     first `early` inputs of the program are what is computed before the loop.
+
+    Names in the text: %x and %o are inputs and outputs of the body, %e what is computed
+    early; %r and %w are the rows that are read and written, %l and %t a place in each.
     """
     vector_type = _type_of(lanes)
     count = len(program.inputs)

@@ -113,6 +113,7 @@ class Base(Section):
         """Refuse triangles without area and left-handed ones."""
         if self.v is None:
             return
+        # Columns of many scenes have the row last: it comes first here.
         v = np.moveaxis(np.asarray(self.v), (0, 1), (-2, -1))
         lengths = np.linalg.norm(v, axis=-1)
         volume = np.linalg.det(v / lengths[..., None])
@@ -134,6 +135,7 @@ def _directions_of(
 
     It has these arcs [rad], as in `Base`.
     """
+    # v1 . (v2 x v3) = 2 sqrt(product) = z sin a12, where z is the last entry of v3.
     half = 0.5 * (a12 + a23 + a31)
     product = (
         math.sin(half)

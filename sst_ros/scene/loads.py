@@ -8,6 +8,7 @@ recording does. A motion that names no start begins in the initial pose of the s
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from itertools import pairwise
 
@@ -196,7 +197,7 @@ class Spiral(Section):
     Ry(phi) Rz(psi - theta). All three grow from zero by one minimum jerk.
     """
 
-    phi: float = entry("tilt at the end", "rad", least=0.0, most=3.141592653589793)
+    phi: float = entry("tilt at the end", "rad", least=0.0, most=math.pi)
     theta: float = entry("how far the direction of the tilt turns", "rad")
     psi: float = entry("turn about E at the end", "rad", default=0.0)
     duration: float = _duration()

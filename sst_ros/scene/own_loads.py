@@ -23,9 +23,8 @@ ROTATION = tuple(f"R{i}{j}" for i in "123" for j in "123")
 ANGLE_NAMES = tuple(
     f"{angle}_{leg}" for angle in ("gamma", "mu", "beta") for leg in (1, 2, 3)
 )
-OMEGA = tuple(
-    f"omega_{axis}" for axis in "xyz"
-)  # angular velocity of the star in {B} [rad/s]
+# angular velocity of the star in {B} [rad/s]
+OMEGA = tuple(f"omega_{axis}" for axis in "xyz")
 BODY_RATE = tuple(f"body_rate_{axis}" for axis in "xyz")  # the same in {E}
 RATE_NAMES = tuple(name.replace("_", "_dot_") for name in ANGLE_NAMES)
 
@@ -114,7 +113,7 @@ class FormulaLoad(Section):
             if not fault:
                 size += sum(1 for _ in ast.walk(parse(text)))
             name = key.removeprefix("terms.")
-            if name != key:
+            if name != key:  # the formula of a term
                 strange = _is_strange(name) or name in usable_names
                 yield strange, key, name, f"{_describe_name()}, and given once"
                 usable_names.add(name)

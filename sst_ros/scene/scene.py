@@ -326,7 +326,8 @@ class Scenarios:
                         raise ValueError(yaml_document.NO_NUMBER)
                     if place in self._places:
                         raise ValueError("is given twice")
-                    self._places[place], self._specs[key] = key, spec
+                    self._places[place] = key
+                    self._specs[key] = spec
                 self.rows[key] = self._rows_of(value, spec.shape)
                 self.count = len(self.rows[key])
             except (TypeError, ValueError, OverflowError, MemoryError) as error:

@@ -233,6 +233,7 @@ class Section:
         values = []
         for name, spec in self.SPECS.items():
             value = getattr(self, name)
+            # None is allowed where it is the default: then the field is left out.
             if value is not None or spec.default is not None:
                 values.append((name, spec, value))
         try:
@@ -294,7 +295,7 @@ class Section:
             yield Problem("", chosen or None, "give one of " + ", ".join(self.ONE_OF))
 
     def settle(self) -> Iterator[Problem]:
-        """Put what may be given in several forms into one; yield what forbids that."""
+        """Normalize alternative input forms; yield what forbids that."""
         return iter(())
 
     def _find_broken(self) -> Iterator[Problem]:

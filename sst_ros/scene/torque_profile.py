@@ -186,6 +186,8 @@ class SineTorque(TorqueProfile, Section):
             # The step control has to find those of a sine that is too fast.
             if not 0.0 < f * end <= _MOST_CROSSINGS:
                 continue
+            # The torque passes the limit, of either sign, where the sine's argument is
+            # a multiple of pi plus or minus this angle.
             angle = np.arcsin(limit / amplitude)
             first_turn = np.floor(phase / np.pi) - 1
             last_turn = np.ceil((phase + f * end) / np.pi) + 2
@@ -415,7 +417,7 @@ def _read_rows(
     if not lines:
         problems.append(Problem("rows", 0, "must be one or more"))
     places = [header.index(column) for column in _TORQUE_COLUMNS]
-    times = [-math.inf]
+    times = [-math.inf]  # before the first row; left out of the result
     torques = []
     for line, row in lines:
         numbers = None
