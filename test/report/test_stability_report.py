@@ -71,7 +71,7 @@ def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch, kind, only, 
     def simulate(scene, tolerance, **options):
         given, estimate = kind(tolerance)
         motion = honest(scene, **given, **options)
-        motion.error_estimate = estimate
+        motion.run = dataclasses.replace(motion.run, error_estimate=estimate)
         return motion
 
     monkeypatch.setattr(stability, "simulate", simulate)
