@@ -554,6 +554,15 @@ def _program_of(
     return Program(names, steps, ()).prune([operand(result) for result in results])
 
 
+def execute(text: str, names: dict[str, Any]) -> None:
+    """Execute the text of a program with its names.
+
+    The text is compiled first: where Ctrl-C comes in the `exec` of a text, CPython ends
+    with the signal as its status, even if the KeyboardInterrupt is caught.
+    """
+    exec(compile(text, "<program>", "exec"), names)
+
+
 def compile_program(
     program: Program, functions: Mapping[str, Any] | None = None
 ) -> Callable[..., tuple[Any, ...]]:
@@ -562,7 +571,7 @@ def compile_program(
     The function raises ArithmeticError or ValueError where a float has no value.
     """
     names: dict[str, Any] = {**(functions or MATH_FUNCTIONS)}
-    exec(program.source("function"), names)
+    execute(program.source("function"), names)
     function: Callable[..., tuple[Any, ...]] = names["function"]
     return function
 
@@ -581,7 +590,7 @@ def _flat_tanh() -> Callable[..., tuple[Any, ...]]:
 def _tanh_of_array(x: Any) -> Any:
     """Hyperbolic tangent of an array, with the bits of `tanh_of_float`."""
     names: dict[str, Any] = {"where": np.where, "power_of_two": _powers_of_two}
-    exec(tanh_program().source("function", templates=_ON_ARRAYS), names)
+    execute(tanh_program().source("function", templates=_ON_ARRAYS), names)
     (result,) = names["function"](x)
     return result
 
@@ -605,7 +614,7 @@ def compile_for_arrays(
             names[name] = _by_element(of_floats) if exact else of_arrays
     if exact:
         names["tanh"] = _tanh_of_array
-    exec(program.source("function", templates=_ON_ARRAYS), names)
+    execute(program.source("function", templates=_ON_ARRAYS), names)
     function: Callable[..., tuple[Any, ...]] = names["function"]
     return function
 

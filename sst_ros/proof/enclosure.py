@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from sst_ros.programs.expression import MATH_FUNCTIONS, Program
+from sst_ros.programs.expression import MATH_FUNCTIONS, Program, execute
 from sst_ros.proof.balls import (
     arb,
     arb_mat,
@@ -292,9 +292,9 @@ def compile_on_balls(program: Program, constants: Sequence[Any]) -> Function:
         ]
         for lines in (before, after)
     )
-    exec("\n".join(before), names)
+    execute("\n".join(before), names)
     lines = [f"def function({', '.join(program.inputs[:count])}):", *after]
-    exec("\n    ".join([*lines, f"return ({', '.join(results)},)"]), names)
+    execute("\n    ".join([*lines, f"return ({', '.join(results)},)"]), names)
     function: Function = names["function"]
     return function
 

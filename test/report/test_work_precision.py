@@ -126,7 +126,7 @@ def test_every_row_is_whole(short):
 
 
 def test_what_it_writes_can_be_read(short, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(accuracy, "study_scene", lambda scene, shown: short)
+    monkeypatch.setattr(accuracy, "study_scene", lambda scene, visible: short)
     assert write_accuracy_report(["example2_heavy"], tmp_path) == [short]
     said, words = capsys.readouterr().out, name_fastest(short)
     assert words in said and words.startswith("1e-09 rad over 0.2 s: ")
