@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors that sst_ros raises on purpose, with values that explain them.
 
-Optional modules.
+A missing optional module is one of them: the error says how to install it.
 """
 
 from __future__ import annotations
@@ -258,9 +258,11 @@ def check_kinds(function: F, *, late: bool = False) -> F:
         return kind.find_fault(value)
 
     def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:
-        values = [*zip(names, args, strict=False), *options.items()]
-        faults = [(name, value, find_fault(name, value)) for name, value in values]
-        if problems := [Problem(*fault) for fault in faults if fault[2]]:
+        problems = []
+        for name, value in [*zip(names, args, strict=False), *options.items()]:
+            if fault := find_fault(name, value):
+                problems.append(Problem(name, value, fault))
+        if problems:
             raise InputError(origin, problems)
 
     @functools.wraps(function)

@@ -21,12 +21,14 @@ from matplotlib.figure import Figure
 
 from sst_ros.state import Array
 
-BLUE, VERMILION, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#666666"
-PURPLE, ORANGE, INK = "#CC79A7", "#E69F00", "#222222"
-"""Colours that the colour-blind can distinguish (Okabe and Ito).
-
-Line styles differ too.
-"""
+# colours that the colour-blind can distinguish (Okabe and Ito); line styles differ too
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+GREEN = "#009E73"
+GREY = "#666666"
+PURPLE = "#CC79A7"
+ORANGE = "#E69F00"
+INK = "#222222"
 
 MARKERS = {
     "rk4": (BLUE, "o"),

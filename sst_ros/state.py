@@ -168,14 +168,13 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
     if isinstance(value, (list, tuple)):
         if depth == _DEEPEST_LIST:
             return "must be numbers, in rows of equal length"
-        suspects = tuple(
-            dtype_kind
-            for dtype_kind in set(map(type, value))
-            if not _is_plain(dtype_kind)
-        )
-        for each in value if suspects else ():
-            if isinstance(each, suspects):
-                reason = find_lost_meaning(each, seconds=seconds, depth=depth + 1)
+        entry_types = set(map(type, value))
+        suspects = tuple(each for each in entry_types if not _is_plain(each))
+        if not suspects:
+            return ""
+        for entry in value:
+            if isinstance(entry, suspects):
+                reason = find_lost_meaning(entry, seconds=seconds, depth=depth + 1)
                 if reason:
                     return reason
         return ""

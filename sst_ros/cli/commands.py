@@ -42,11 +42,9 @@ class Arg:
     def __init__(
         self, name: str, description: str = "", *, completer: str = "", **options: Any
     ) -> None:
-        self.name, self.options, self.completer = (
-            name,
-            {**options, "help": description},
-            completer,
-        )
+        self.name = name
+        self.options = {**options, "help": description}
+        self.completer = completer
 
 
 class Subcommand:
@@ -59,8 +57,11 @@ class Subcommand:
     def __init__(
         self, description: str, run: str, *args: Arg, needs: str = "", details: str = ""
     ) -> None:
-        self.what, self.run, self.arguments = description, run, args
-        self.needs, self.more = needs.split(), details
+        self.what = description
+        self.run = run
+        self.arguments = args
+        self.needs = needs.split()
+        self.more = details
 
 
 def _number_of(convert: Callable[[str], Any], text: str) -> Any:
@@ -535,10 +536,13 @@ def parser() -> Parser:
             last, help=entry.what, description=entry.more or None
         )
         command.set_defaults(entry=entry)
-        for each in entry.arguments:
-            action: Any = command.add_argument(each.name, **each.options)
-            if each.completer:
-                action.completer = lambda names=each.completer, **_: function(names)()
+        for argument in entry.arguments:
+            action: Any = command.add_argument(argument.name, **argument.options)
+            if argument.completer:
+                # A default binds the name of this turn of the loop.
+                action.completer = lambda names=argument.completer, **_: function(
+                    names
+                )()
     for name, description in NODE_HELP.items():
         groups[""].add_parser(name, help=description, add_help=False)
     return result
@@ -595,11 +599,11 @@ def run_command(arguments: list[str]) -> int:
 def _run(arguments: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:
         importlib.import_module("argcomplete").autocomplete(parser())
-    if arguments and arguments[0] in NODE_HELP:
+    command = arguments[0] if arguments else ""
+    if command in NODE_HELP:
         return int(function("nodes.process:run")(arguments))
-    for argument in arguments[:1]:
-        if argument in REMOVED_COMMANDS:
-            raise refusal("command", argument, "given", REMOVED_COMMANDS[argument])
+    if command in REMOVED_COMMANDS:
+        raise refusal("command", command, "given", REMOVED_COMMANDS[command])
     options, unknown = parser().parse_known_args(arguments)
     if unknown:
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")

@@ -6,6 +6,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+from collections.abc import Sequence
+from typing import Any
 
 from sst_ros.cli.commands import free_out, function
 from sst_ros.control.plan import (
@@ -20,7 +22,7 @@ from sst_ros.control.plan import (
 )
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.dynamics.reactions import SIZES
-from sst_ros.errors import refuse_unless
+from sst_ros.errors import Check, refuse_unless
 from sst_ros.files import require_free, write_into
 from sst_ros.identification.excitation import ExcitingMotion, design
 from sst_ros.identification.identify import identify
@@ -32,7 +34,10 @@ from sst_ros.sweeps.cluster import connect
 from sst_ros.sweeps.sweep import read_sweep, run_study, summarize
 from sst_ros.sweeps.sweep_study import SweepStudy
 
-PLOT, DESIGN = "plot", "design"  # words in place of a study, and of a bag
+PLOT = "plot"  # a word in place of a study
+DESIGN = "design"  # a word in place of a bag
+RECORDED_OPTIONS = ("cutoff", "delay", "scene", "method", "namespace")
+DESIGN_OPTIONS = ("duration", "harmonics", "seed")
 
 
 def check_plan(options: argparse.Namespace) -> int:
@@ -42,8 +47,8 @@ def check_plan(options: argparse.Namespace) -> int:
     refuse_unless("plan check", ("--period", options.period, is_period, requirement))
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
-    # needs rosbags
-    scene, of_bag = load(options.scene), "recording.recording:read_run_motion"
+    scene = load(options.scene)
+    of_bag = "recording.recording:read_run_motion"  # its module needs rosbags
     motion = reference_motion(scene, lambda bag, name: function(of_bag)(bag, name))
     plan = examine_motion(motion, scene)
     speeds = time_scaling(plan)
@@ -135,13 +140,16 @@ def run_sweep(options: argparse.Namespace) -> None:
     if not options.resume:
         free_out(options, folder)
     study = SweepStudy.read(options.study)
-    workers, resume = options.workers or 0, options.resume
     with contextlib.ExitStack() as end:
         client = connect(options.scheduler) if options.scheduler else None
         if client is not None:
             end.callback(client.close, timeout=5)
         results = run_study(
-            study, folder, client=client, workers=workers, resume=resume
+            study,
+            folder,
+            client=client,
+            workers=options.workers or 0,
+            resume=options.resume,
         )
     print(summarize(results), end="")
     print(f"Results in {folder}; `sst-ros sweep plot {folder}` draws them.")
@@ -152,24 +160,22 @@ def run_identification(options: argparse.Namespace) -> None:
 
     The designed motion determines the parameters of the scene.
     """
-    designing, later = (
-        options.bag == DESIGN,
-        "must be given after design, and only there",
-    )
-    ours, foreign_options = (
-        ("duration", "harmonics", "seed"),
-        ("cutoff", "delay", "scene", "method", "namespace"),
-    )
-    chosen, foreign = (
-        {name: value for name in names if (value := getattr(options, name)) is not None}
-        for names in ((ours, foreign_options) if designing else (foreign_options, ours))
-    )
-    absent = f"is no option of identify {DESIGN if designing else 'BAG'}"
-    refuse_unless(
-        "identify",
-        *((f"--{name}", value, False, absent) for name, value in foreign.items()),
-        ("SCENE", options.designed, designing == (options.designed is not None), later),
-    )
+    designing = options.bag == DESIGN
+    if designing:
+        chosen = _given_options(options, DESIGN_OPTIONS)
+        foreign = _given_options(options, RECORDED_OPTIONS)
+        requirement = f"is no option of identify {DESIGN}"
+    else:
+        chosen = _given_options(options, RECORDED_OPTIONS)
+        foreign = _given_options(options, DESIGN_OPTIONS)
+        requirement = "is no option of identify BAG"
+    checks: list[Check] = []
+    for name, value in foreign.items():
+        checks.append((f"--{name}", value, False, requirement))
+    is_placed = designing == (options.designed is not None)
+    after_design = "must be given after design, and only there"
+    checks.append(("SCENE", options.designed, is_placed, after_design))
+    refuse_unless("identify", *checks)
     if options.out is not None:
         free_out(options, options.out)
     result: ExcitingMotion | Identification
@@ -184,3 +190,9 @@ def run_identification(options: argparse.Namespace) -> None:
         with write_into(options.out.parent, "identify"):
             options.out.write_text(dump(result.scene), encoding="utf-8")
         print(f"wrote {options.out}")
+
+
+def _given_options(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Return those of some options that are given, by their names."""
+    values = {name: getattr(options, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None}

@@ -50,10 +50,10 @@ def draw_pictures(options: argparse.Namespace) -> int:
         return 0
     if options.compare:
         print("plot --compare is deprecated: use sst-ros compare", file=sys.stderr)
-        options.bags, options.csv = (
-            [*filter(None, [options.bag]), *options.compare],
-            None,
-        )
+        options.bags = list(options.compare)
+        if options.bag is not None:
+            options.bags.insert(0, options.bag)
+        options.csv = None
         options.namespace = [options.namespace] if options.namespace else []
         return compare_runs(options)
     if options.bag is None:

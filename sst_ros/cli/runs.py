@@ -57,8 +57,10 @@ def check_files(options: argparse.Namespace) -> int:
     for path in options.files:
         try:
             warning = implausible(check(path))
-            print(f"{path}: valid" + (", with warnings" if warning else ""))
-            if warning:
+            if not warning:
+                print(f"{path}: valid")
+            else:
+                print(f"{path}: valid, with warnings")
                 print(f"{path}: warning: {warning}")
         except SstError as error:
             failed = 1
@@ -69,9 +71,7 @@ def check_files(options: argparse.Namespace) -> int:
 def check(name_or_path: str | Path) -> Scene:
     """Read a scene and assemble it at its initial state, which `load` does not.
 
-    Faults have lines.
-
-    Every fault is in one InputError.
+    One InputError has every fault, with its line.
     """
     source, origin = text_of(name_or_path)
     scene = read(Scene, source, origin)
@@ -95,7 +95,8 @@ def implausible(scene: Scene) -> str:
     """
     star = scene.star
     # A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O.
-    trace, most = float(star.inertia.matrix.trace()), 2.0 * star.mass * star.radius**2
+    trace = float(star.inertia.matrix.trace())
+    most = 2.0 * star.mass * star.radius**2
     if star.mass == 0.0 or trace <= most * (1.0 + INERTIA_ROUNDING):
         return ""
     return (
@@ -216,7 +217,8 @@ def certify_scene(options: argparse.Namespace) -> int:
 
 def prove_zone(options: argparse.Namespace) -> int:
     """Print what is proven of a zone of the workspace; draw and write it."""
-    target, picture = options.out, options.picture
+    target = options.out
+    picture = options.picture
     if target is not None:
         free_out(options, target)
     if picture is not None:

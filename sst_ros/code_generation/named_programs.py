@@ -37,13 +37,11 @@ from sst_ros.version import VERSION
 
 CALLER = "equations"  # heads the messages of what is refused
 
-STATE_ARGUMENT, TORQUES, MOMENT_ARGUMENT, PARAMETERS = (
-    "state",
-    "torque",
-    "moment",
-    "parameters",
-)
-"""Names of the arguments of the equations."""
+# names of the arguments of the equations
+STATE_ARGUMENT = "state"
+TORQUES = "torque"
+MOMENT_ARGUMENT = "moment"
+PARAMETERS = "parameters"
 
 STATE_QUANTITIES = (
     "quaternion x of {E} in {B} [1]",
@@ -172,12 +170,11 @@ class SceneEquations:
         if not self.parameters:
             return ()
         symbols = tuple(f"p{i}" for i in range(len(self.parameters)))
-        keys = zip(self.parameters, self.values, strict=True)
-        quantities = tuple(
-            f"{key} [{_unit_of(self.scene, key)}], in the scene {value!r}"
-            for key, value in keys
-        )
-        return (Argument(PARAMETERS, symbols, quantities),)
+        quantities = []
+        for key, value in zip(self.parameters, self.values, strict=True):
+            unit = _unit_of(self.scene, key)
+            quantities.append(f"{key} [{unit}], in the scene {value!r}")
+        return (Argument(PARAMETERS, symbols, tuple(quantities)),)
 
     @property
     def header(self) -> list[str]:
@@ -279,6 +276,8 @@ def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
     arguments = (equations.state, *equations.acting, *equations.open)
     derivative = trace(equations.derivative, _symbols(arguments), by.symbols)
     rows = equations.state.size
+    # Behind the derivative itself, its slopes by one number of the argument after the
+    # other.
     columns = np.arange(rows, len(derivative.outputs)).reshape(by.size, rows)
     entries = [derivative.outputs[i] for i in columns.T.ravel()]
     program = derivative.prune(entries)

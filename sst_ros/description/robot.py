@@ -232,10 +232,11 @@ def shapes(scene: Scene) -> dict[str, list[Shape]]:
     for actuated, intermediate, colour in zip(
         ACTUATED_LINKS, INTERMEDIATE, LEG_COLOURS, strict=True
     ):
-        bearing = z * (base - bar), z * (quarter + 2.0 * bar)
+        bearing_foot = z * (base - bar)
+        bearing_end = z * (quarter + 2.0 * bar)
         drawn[actuated] = [
             Arc(x, -y, np.pi / 2, quarter, bar, colour),
-            Rod(*bearing, 2.4 * bar, colour),
+            Rod(bearing_foot, bearing_end, 2.4 * bar, colour),
         ]
         drawn[intermediate] = [
             Rod(x * (base - bar), x * star, 0.9 * bar, STEEL),
@@ -362,9 +363,8 @@ def _limited_joints(
 ) -> Iterator[tuple[Joint, dict[str, float], Friction | None]]:
     """Yield each joint with the attributes of its limit, and its friction."""
     ranges = {}
-    for joint_number, lower, upper in ranges_of(
-        [*limits_of(scene, Geometry.of(scene))]
-    ):
+    scene_limits = list(limits_of(scene, Geometry.of(scene)))
+    for joint_number, lower, upper in ranges_of(scene_limits):
         ranges[joint_number] = (lower, upper)
     torque_limit = getattr(scene.actuators, "torque_limit", None) or SERVO_TORQUE
     rate_limit = getattr(scene.actuators, "velocity_limit", None)
@@ -484,7 +484,8 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     They are exact at p = pi/2 too.
     """
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-    sine, cosine = np.sin(yaw), np.cos(yaw)
+    sine = np.sin(yaw)
+    cosine = np.cos(yaw)
     pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
     roll = np.arctan2(
         sine * rotation[0, 2] - cosine * rotation[1, 2],

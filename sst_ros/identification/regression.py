@@ -46,14 +46,14 @@ LIKE_NOISE = 1.1  # ratio of residuals that are alike
 MOST_TRIALS = 2  # signs and orders of torques that are fitted, the likeliest first
 # share of a period by which the slope of the equations by the delay is taken
 _SLOPE_STEP = 0.25
-# of the delay, and of its column, which depends on the estimates
-_DELAY_STEPS, _SLOPES = 20, 4
+_DELAY_STEPS = 20  # of Gauss-Newton for the delay
+_SLOPES = 4  # of the column of the delay, which depends on the estimates
 
 
 class WeightedFit(NamedTuple):
     """What `RegressionEquations.fit` finds.
 
-    Root, R^T R, is the inverse of the covariance.
+    The root R is such that R^T R is the inverse of the covariance.
     """
 
     base: BaseParameters
@@ -382,10 +382,15 @@ class RegressionEquations:
         if frequencies:
             relative = np.concatenate(frequencies)
             relative = relative / relative.max()
-        torque, known, columns = (
-            np.concatenate(each) for each in zip(*rows, strict=True)
+        torques, known_torques, columns_of_paths = zip(*rows, strict=True)
+        return FormedEquations(
+            torque=np.concatenate(torques),
+            known=np.concatenate(known_torques),
+            columns=np.concatenate(columns_of_paths),
+            frequencies=relative,
+            samples=samples,
+            notes=notes,
         )
-        return FormedEquations(torque, known, columns, relative, samples, notes)
 
 
 def _transform(equations: tuple[Array, Array, Array], count: int) -> Any:

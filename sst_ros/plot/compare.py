@@ -205,10 +205,13 @@ def _common(first: Signals, run: Signals) -> tuple[NDArray[np.intp], NDArray[np.
     """Places of the samples that two runs have at the same time since their starts."""
     if "samples" not in first.tables or "samples" not in run.tables:
         return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
-    common = np.intersect1d(
-        first.time_ns("samples"), run.time_ns("samples"), True, True
+    _, rows_of_first, rows = np.intersect1d(
+        first.time_ns("samples"),
+        run.time_ns("samples"),
+        assume_unique=True,
+        return_indices=True,
     )
-    return common[1], common[2]
+    return rows_of_first, rows
 
 
 def labels(runs: Sequence[Signals]) -> list[str]:

@@ -54,9 +54,9 @@ FIGURE_NUMBERS = {
 }
 """Number of a picture in the paper, by the name of the scene."""
 ASSUMPTION = "assumed inertias: the paper's are lost"
+# an axis never shows less than this, so that rounding is a flat line
 LEAST_POSITION_M = 0.05
 LEAST_ANGLE_DEG = 1.0
-"""An axis never shows less than this, so that rounding is a flat line."""
 POSITION = "position of E in {B} [m]"
 ZYZ = "θφψ"
 
@@ -371,6 +371,7 @@ def _energy(run: Signals, scene: Scene) -> Figure:
     The difference is what friction, loads from outside and the integrator took or gave.
     """
     kinetic, potential = energies(run, scene)
+    # The first finite row, or none: the sums below are then zero.
     first = np.flatnonzero(np.isfinite(kinetic))[:1]
     raised = potential - potential[first].sum()
     actuator_work = work(run).sum(axis=1)

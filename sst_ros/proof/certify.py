@@ -92,7 +92,8 @@ LIMIT_ORDER = 6  # of expansions whose signs say where limits are
 SPLITS = 200  # of a step, most of them near a limit
 TURN_SPLITS = 80  # of a step in which a joint may turn back: a joint may be at rest
 TURN_SYMBOLS = ("turn_x", "turn_y", "turn_z")
-GAMMA_SYMBOLS, ANGLE_RATES = ("g1", "g2", "g3"), ("gd1", "gd2", "gd3")
+GAMMA_SYMBOLS = ("g1", "g2", "g3")
+ANGLE_RATES = ("gd1", "gd2", "gd3")
 _UNIT_QUATERNIONS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 KNOWN_TORQUES = "must be numbers, sines, a table, polynomials or a Controller"
 AT_START = "the posture at the start is not proven to be the only one near"
@@ -152,9 +153,10 @@ class BallEquations:
             *self.balls.initial("gamma"),
             *self.balls.initial("gamma_dot"),
         ]
-        parameters = [
-            x.ball if isinstance(x, NumberReading) else x for x in initial_numbers
-        ]
+        parameters = []
+        for number in initial_numbers:
+            is_reading = isinstance(number, NumberReading)
+            parameters.append(number.ball if is_reading else number)
         parameters += self.balls.varied_balls
         root = krawczyk(run, [0.0, 0.0, 0.0, *rate], parameters, AT_START)
         size = len(self.state)
@@ -191,7 +193,7 @@ class BallEquations:
             slopes.append(row)
         turned = quaternion_product((x, y, z, w), (*root.middle[:3], arb(1)))
         lagged = [arb(0)] * (size - len(MOTION))
-        varied = [arb(x.mid()) for x in parameters[len(initial) :]]
+        varied = [arb(ball.mid()) for ball in parameters[len(initial) :]]
         centre = [*turned, *root.middle[3:], *lagged, *varied]
         region = Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
         return region if self.loop is None else self.loop.begin(region)
@@ -212,12 +214,15 @@ class BallEquations:
         reading_errors = [arb(0)] * len(root.middle)
         radii = [arb(0)] * n
         for j, ball in enumerate(parameters):
-            place = j if j < len(initial_numbers) else size + j - len(initial_numbers)
+            reading = None
+            if j < len(initial_numbers):
+                reading = initial_numbers[j]
+                place = j
+            else:
+                place = size + j - len(initial_numbers)
             factor = arb(1)
             radius = ball.rad()
-            if j < len(initial_numbers) and isinstance(
-                reading := initial_numbers[j], NumberReading
-            ):
+            if isinstance(reading, NumberReading):
                 place = n - 1
                 factor = reading.half
                 radius = arb(0)
@@ -253,9 +258,9 @@ class BallEquations:
 
     @cached_property
     def derivatives(self) -> tuple[Function, Function]:
-        """The derivative of time, state, commands and varied numbers.
+        """The derivative of the state, without and with the Jacobian.
 
-        It with the Jacobian.
+        Both are functions of time, state, commands and varied numbers.
         """
         size = len(self.state)
 
@@ -326,6 +331,7 @@ class BallEquations:
     @cached_property
     def stops(self) -> list[Limit]:
         """Limits of the mechanism, at which the scene may stop or not."""
+        # Of a scene `limits_of` reads these two alone: here as if all limits stop.
         stop: Any = SimpleNamespace(at_end="stop", at_edge="stop")
         every: Any = SimpleNamespace(stroke=stop, workspace=stop)
         return list(limits_of(every, Geometry.of(self.scene)))
@@ -420,11 +426,9 @@ class BallEquations:
             values = []
             for limit in self.stops:
                 joint_kind, k = divmod(limit.joint, 3)
-                end = (
-                    ends[joint_kind][k]
-                    if limit.sign < 0.0 and joint_kind in ends
-                    else limit.end
-                )
+                end = limit.end
+                if limit.sign < 0.0 and joint_kind in ends:
+                    end = ends[joint_kind][k]
                 values.append(limit.sign * (angles[limit.joint] - end))
             values.append(dot3(first, cross3(second, third)))
             for k in range(3 if is_elastic else 0):
@@ -449,7 +453,10 @@ def _start_equations(orientation: Quadruple) -> Callable[..., list[Any]]:
     """
 
     def equations(traced_scene: Parts, *inputs: Any) -> list[Any]:
-        turn, body_rate, angles, rates = (inputs[k : k + 3] for k in range(0, 12, 3))
+        turn = inputs[0:3]
+        body_rate = inputs[3:6]
+        angles = inputs[6:9]
+        rates = inputs[9:12]
         q = quaternion_product(orientation, (turn[0], turn[1], turn[2], 1.0))
         legs = list(kernel.leg_motions(traced_scene.model, (*q, *body_rate)))
         gaps = []
@@ -714,7 +721,8 @@ class ProvenMotion(Explained):
         shortest = min(parts, key=lambda proof: proof.until)
         failed = [proof for proof in parts if not proof.is_whole]
         self.until = shortest.until
-        self.reason = (failed or [shortest])[0].reason
+        deciding = failed[0] if failed else shortest
+        self.reason = deciding.reason
         self.steps = sum(proof.steps for proof in parts)
         self._is_whole = not failed
         rows, spans = unite(parts)
@@ -742,11 +750,10 @@ class ProvenMotion(Explained):
         """Largest tracking error of a joint at a tick that is possible [rad]."""
         most = 0.0 if self.tracking else math.inf
         for leg in (1, 2, 3):
-            middle, bound = (
-                self.tracking.get(f"error_{leg}{x}", ()) for x in ("", "_bound")
-            )
-            for x, r in zip(middle, bound, strict=True):
-                most = max(most, upper(abs(arb(float(x))) + arb(float(r))))
+            errors = self.tracking.get(f"error_{leg}", ())
+            bounds = self.tracking.get(f"error_{leg}_bound", ())
+            for error, bound in zip(errors, bounds, strict=True):
+                most = max(most, upper(abs(arb(float(error))) + arb(float(bound))))
         return most
 
     @property
@@ -827,6 +834,8 @@ def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
         (x / norm(a), arb(y) / norm(list(map(arb, b))))
         for x, y in zip(a, b, strict=True)
     ]
+    # Unit quaternions an angle apart have the chord 2 sin(angle / 4); q and -q are one
+    # orientation.
     chords = (norm([x - sign * y for x, y in pairs]) for sign in (1, -1))
     return 4 * (min(chords, key=float) / 2).asin()
 
@@ -858,7 +867,10 @@ def _signs(
 
 
 def split_ranges(ranges: Mapping[Place, Any], box_count: int) -> list[dict[Place, Any]]:
-    """Split a box of ranges by halves, the one of most its first width first."""
+    """Halve a box of ranges until there are as many boxes.
+
+    Each is halved along the range of which it has the largest share.
+    """
     boxes = [dict(ranges)]
     while len(boxes) < box_count:
         box = boxes.pop(0)
@@ -954,7 +966,10 @@ class ProofTask(NamedTuple):
         return places
 
     def _advise(self, ranges: Mapping[Place, Any], steps: int) -> str:
-        """Say what share of the width of ranges would do; `steps` are those of none."""
+        """Say what share of the width of ranges would do.
+
+        `steps` are those of the proof without ranges.
+        """
         most = min(self.max_steps, NARROW_STEPS * (steps + SPARE_STEPS))
         halvings = self._replace(max_steps=most)._needed_halvings(ranges)
         if halvings is None:
@@ -1088,6 +1103,7 @@ def certify(
     )
     assert profile is not None and end is not None
     own_torque = profile == simulated_scene.torque
+    # `simulate` ends at a whole nanosecond.
     end = round(end * NANOSECONDS) / NANOSECONDS
     kinks = profile.kinks()
     if control is not None:

@@ -116,8 +116,9 @@ def begins(recording: Recording) -> bool:
         return True
     start = recording.scene.initial
     _, gamma, gamma_dot = _true_samples(recording)
-    off = np.abs(gamma[0] - start.gamma), np.abs(gamma_dot[0] - start.gamma_dot)
-    return bool(np.nanmax(off, initial=0.0) < SAME_START)
+    angle_off = np.abs(gamma[0] - start.gamma)
+    rate_off = np.abs(gamma_dot[0] - start.gamma_dot)
+    return bool(np.nanmax([angle_off, rate_off], initial=0.0) < SAME_START)
 
 
 def _true_samples(run: Recording) -> tuple[Array, Array, Array]:

@@ -61,6 +61,9 @@ STATISTICS = {
 }
 """What is shown of periods and delays, as pandas and as the summary name it."""
 
+PACE_PIECES = 60
+"""At most so many pieces of a run, whose pace is a line over the run."""
+
 LEAST_ANSWERED_PERCENT = 90.0
 """A controller at the rate of the samples answers nearly all of them; one that is late
 or whose commands are lost answers fewer."""
@@ -213,7 +216,7 @@ def _summarise_efforts(run: Recording) -> dict[str, float | None]:
     }
 
 
-def _count(run: Recording, measured: Timing) -> dict[str, Any]:
+def _count(run: Recording, timing: Timing) -> dict[str, Any]:
     """Collect what was recorded.
 
     These are the last diagnostics of the simulator, samples, ticks and losses.
@@ -225,7 +228,7 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
             numbers[key] = value
     counts = {key: round(value) for key, value in numbers.items()}
     recorded = len(run.time_ns)
-    missing_between = len(measured.lost_s)
+    missing_between = len(timing.lost_s)
     published = counts.get("samples_published")
     # Diagnostics that end before the run does know of fewer samples than the bag holds.
     lost = max(missing_between, (published or 0) - recorded)
@@ -265,7 +268,7 @@ def _count(run: Recording, measured: Timing) -> dict[str, Any]:
         "actuators_lag": run.scene.lags,
         "topics_missing": list(run.missing),
         "damage": list(run.signals.bag.damage),
-        "unknown": measured.missing,
+        "unknown": timing.missing,
         "report": made_on(),
     }
 
@@ -327,9 +330,9 @@ def _lost_times(recording: Recording) -> Array:
 
 
 def _measure_pace(recording: Recording) -> Series[float]:
-    """Return simulated time per received time over at most sixty pieces of the run."""
+    """Return simulated time per received time over pieces of the run."""
     time_ns = recording.time_ns
-    borders = np.linspace(0, len(time_ns) - 1, min(61, len(time_ns)))
+    borders = np.linspace(0, len(time_ns) - 1, min(PACE_PIECES + 1, len(time_ns)))
     rows = np.unique(borders.round().astype(int))
     with np.errstate(divide="ignore", invalid="ignore"):
         pace = np.diff(time_ns[rows]) / np.diff(recording.received_ns[rows])
@@ -363,18 +366,19 @@ def pair_commands(recording: Recording) -> DataFrame:
     most = np.inf if limit is None else limit
     commanded = np.clip(commands.torque, -most, most) + 0.0
     applied = np.clip(ticks.torque, -most, most) + 0.0
-    new = _changes(commanded)
-    changed = _changes(applied)
+    new_commands = _changes(commanded)
+    changed_ticks = _changes(applied)
     # When the steps of ticks began, interpolated between the receptions of samples.
     first_ns = recording.received_ns[0]
     since_ns = (recording.received_ns - first_ns).astype(float)
     steps_since_ns = np.interp(ticks.end_ns, recording.time_ns, since_ns)
     step_ns = first_ns + steps_since_ns.astype(np.int64)
-    earliest_ns = commands.received_ns[new] - ticks.period_ns
-    left = pd.DataFrame(commanded[new], columns=legs)
-    left = left.assign(command=new, ns=earliest_ns).sort_values("ns", kind="stable")
-    right = pd.DataFrame(applied[changed], columns=legs)
-    right = right.assign(tick=changed, ns=step_ns[changed])
+    earliest_ns = commands.received_ns[new_commands] - ticks.period_ns
+    left = pd.DataFrame(commanded[new_commands], columns=legs)
+    left = left.assign(command=new_commands, ns=earliest_ns)
+    left = left.sort_values("ns", kind="stable")
+    right = pd.DataFrame(applied[changed_ticks], columns=legs)
+    right = right.assign(tick=changed_ticks, ns=step_ns[changed_ticks])
     right = right.sort_values("ns", kind="stable")
     pairs = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
     # Commands are in order of reception: the last of those that share a tick is the one
@@ -488,7 +492,8 @@ def _find_warnings(numbers: Mapping[str, Any]) -> Iterator[str]:
 
 def _note_recording(run: Recording) -> Iterator[str]:
     """Yield what the recording says of the course of the run."""
-    phase, fault = run.diagnostics.get("phase"), run.diagnostics.get("fault")
+    phase = run.diagnostics.get("phase")
+    fault = run.diagnostics.get("fault")
     if not run.diagnostics:
         yield (
             "no diagnostics are recorded: missed ticks and error estimates are unknown"
@@ -535,8 +540,8 @@ def _note_measurement(run: Recording, numbers: Mapping[str, Any]) -> Iterator[st
     """Yield what the recorded signals are, and are not."""
     if numbers["motion_of"] != "joint_states":
         rms = numbers["measurement_error_rms_rad"]
-        largest = numbers["measurement_error_max_rad"]
-        off = f"{rms:.1e} rad RMS, {largest:.1e} rad at most"
+        most = numbers["measurement_error_max_rad"]
+        off = f"{rms:.1e} rad RMS, {most:.1e} rad at most"
         if numbers["motion_of"] == "true_joint_states":
             yield (
                 "integration error and energy are those of the true motion "

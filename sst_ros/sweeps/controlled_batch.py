@@ -37,9 +37,9 @@ from sst_ros.state import cached_property
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 CONTROL_NEWTON_STEPS = 5
-"""Of the observer at a sample. They square the error.
+"""Newton steps of the observer at a sample.
 
-From one sample to the next it is small.
+Each squares the error, which is small from one sample to the next.
 """
 
 REFERENCES = {"first": 1, **REFERENCE_SIZES, "feedforward": 3, "held": 3}
@@ -150,7 +150,8 @@ class ControlledBlock(Block):
     def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
         """Put states, errors, torques and memory back."""
         super().store(columns_of_block, *columns)
-        given, memory = columns[1], self._feedback.memory
+        given = columns[1]
+        memory = self._feedback.memory
         number = len(columns[2][columns_of_block])
         given[:3, columns_of_block] = self.given[:3, :number]
         memory[:, columns_of_block] = self._memory[:, :number]
@@ -175,10 +176,14 @@ class ControlledBatch:
 
     def __init__(self, batch: Batch, study: SweepStudy) -> None:
         assert study.motion is not None and study.control is not None
-        self._batch, self._scene, self._seed = batch, study.scene, study.seed
+        self._batch = batch
+        self._scene = study.scene
+        self._seed = study.seed
         self._motion: ReferenceMotion = study.motion
         self._control: SampledControl = study.control
-        control, length, period = self._control, study.length, self._control.period
+        control = self._control
+        period = control.period
+        length = study.length
         self.samples = round(length / period)
         fits = self.samples > 0 and abs(self.samples * period - length) <= 1e-9 * length
         requirement = f"must be a whole number of control periods of {period:g} s"
@@ -245,19 +250,17 @@ class ControlledBatch:
 
     def _command(self, joints: Any, of: Mapping[str, Any]) -> tuple[Any, ...]:
         """Return what law and channel send, three torques, and the new memory."""
-        control, space = self._control, ActuatorSpaceMap(Geometry.of(self._scene))
-        reference, gains = (
-            divide(REFERENCES, of["references"]),
-            divide(GAINS, of["gains"]),
-        )
+        control = self._control
+        space = ActuatorSpaceMap(Geometry.of(self._scene))
+        reference = divide(REFERENCES, of["references"])
+        gains = divide(GAINS, of["gains"])
         memory = divide(self._memory_sizes, of["memory"])
         new = dict(memory)
         angle, rate = gains["noise"]
         pairs = zip(of["uniform"][::2], of["uniform"][1::2], strict=True)
         noise = (normal_number(u, v) for u, v in pairs)
-        scaled = [
-            n * by for n, by in zip(noise, (angle,) * 3 + (rate,) * 3, strict=False)
-        ]
+        deviations = (angle,) * 3 + (rate,) * 3
+        scaled = [n * by for n, by in zip(noise, deviations, strict=False)]
         exact = joints.gamma, joints.gamma_dot
         gamma, gamma_dot, new["before"] = control.measure(
             *exact, memory["before"], scaled
@@ -288,15 +291,16 @@ class ControlledBatch:
             new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
             sent = law.bound(sent, gains["plant_limit"][0])
         off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-        sums, most = (
-            zip(memory[x], (*off, *sent), strict=True) for x in ("squares", "largest")
-        )
         new |= {"observed": observed, "integral": answer.integral}
-        new["squares"] = tuple(s + e * e for s, e in sums)
+        squares = zip(memory["squares"], (*off, *sent), strict=True)
+        new["squares"] = tuple(s + e * e for s, e in squares)
+        # The larger of the largest yet and of |e|, without a branch.
+        largest = zip(memory["largest"], (*off, *sent), strict=True)
         new["largest"] = tuple(
-            s + positive(positive(e) + positive(-e) - s) for s, e in most
+            s + positive(positive(e) + positive(-e) - s) for s, e in largest
         )
-        (count,), (last,) = memory["samples"], memory["unsettled"]
+        count = memory["samples"][0]
+        last = memory["unsettled"][0]
         beyond = [positive(e - self._band) + positive(-e - self._band) for e in off]
         new["samples"] = (count + 1.0,)
         new["unsettled"] = (last + law.is_above(sum(beyond)) * (count + 1.0 - last),)
@@ -315,21 +319,23 @@ class ControlledBatch:
         Initial states and gains that differ are given by key. The noise depends on the
         rows of the scenarios in their study; `steps` is a multiple of `samples`.
         """
-        count, hold = len(rows), steps // self.samples
-        start, control = self._motion.at(0.0), self._control
+        count = len(rows)
+        hold = steps // self.samples
+        start = self._motion.at(0.0)
+        control = self._control
         gamma = varied.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = varied.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
         memory = np.zeros((sum(self._memory_sizes.values()), count))
         blocks = divide(self._memory_sizes, memory)  # views of its rows
-        earlier = (
-            control.count(gamma - control.period * rate).T if control.counts else ()
-        )
+        earlier: Any = ()
+        if control.counts:  # encoder angles a period before the start
+            earlier = control.count(gamma - control.period * rate).T
         for name, values in (("observed", start.quaternion), ("before", earlier)):
             for place, value in zip(blocks[name], values, strict=False):
                 place[:] = value
-        noise = (
-            streams(self._seed, rows) if self._noise else np.zeros(0, dtype=np.uint64)
-        )
+        noise = np.zeros(0, dtype=np.uint64)
+        if self._noise:
+            noise = streams(self._seed, rows)
         samples = [tuple(row) for row in self._references.tolist()]
         gains = self._make_gains(batch, varied, count)
         feedback = Feedback(self.answer, samples, hold, memory, gains, noise)

@@ -118,14 +118,15 @@ def sweep(
         MissingDependency: pandas or pyarrow is not installed.
 
     """
-    fits = client is None or hasattr(client, "scheduler_info")
-    named = not isinstance(vary, Iterable) or all(isinstance(key, str) for key in vary)
-    named = named and vary is not None
+    is_client = client is None or hasattr(client, "scheduler_info")
+    has_text_keys = vary is not None
+    if isinstance(vary, Iterable):
+        has_text_keys = all(isinstance(key, str) for key in vary)
     refuse_unless(
-        "sweep", ("client", client, fits, "must be a dask.distributed Client")
+        "sweep", ("client", client, is_client, "must be a dask.distributed Client")
     )
     refuse_unless(
-        "sweep", ("vary", vary, named, "must have keys of the scene, as text")
+        "sweep", ("vary", vary, has_text_keys, "must have keys of the scene, as text")
     )
     rows = {"table" if hasattr(vary, "columns") else "vary": vary}
     settings = {
@@ -137,11 +138,14 @@ def sweep(
         **rows,
     }
     study = SweepStudy.from_values({"scene": scene, **settings})
-    path, run = (
+    return run_study(
+        study,
         None if out is None else Path(out),
-        {"resume": resume, "progress": progress},
+        client=client,
+        workers=workers,
+        resume=resume,
+        progress=progress,
     )
-    return run_study(study, path, client=client, workers=workers, **run)
 
 
 def run_study(
@@ -201,7 +205,8 @@ def _compute(
     study: SweepStudy, out: Path | None, *, client: Any, workers: int, progress: bool
 ) -> pd.DataFrame:
     """Compute the chunks of a study not yet in `out`; return the whole table."""
-    complete, steps = set[int](), None
+    complete: set[int] = set()
+    steps: int | None = None
     if out is not None:
         # With the number of steps that was chosen when it was started.
         complete, steps = find_complete(out, study)
@@ -214,13 +219,12 @@ def _compute(
                 left.unlink(missing_ok=True)
     missing = [index for index in range(study.chunks) if index not in complete]
     total = sum(len(study.rows_of(index)) for index in missing)
-    bar, began, reasons, runs = (
-        Bar("sweep", progress),
-        time.monotonic(),
-        Counter[str](),
-        0,
-    )
-    work, tables = partial(run_chunk, ready, out), dict[int, Any]()
+    bar = Bar("sweep", progress)
+    began = time.monotonic()
+    reasons: Counter[str] = Counter()
+    runs = 0
+    tables: dict[int, Any] = {}
+    work = partial(run_chunk, ready, out)
     if client is None:
         results = run_many(work, missing, workers=workers)
     else:
@@ -290,7 +294,9 @@ class PreparedSweep:
             None if study.control is None else ControlledBatch(self.batch, study)
         )
         # Compiled here, before several threads want it.
-        _ = self.batch.programs, self.controlled and self.controlled.answer
+        _ = self.batch.programs
+        if self.controlled is not None:
+            _ = self.controlled.answer
         over_time = "extremes", "reactions"
         self._quantities = [name for name in study.outputs if name not in over_time]
         self.pilot_error = math.nan
@@ -305,38 +311,38 @@ class PreparedSweep:
         The error of c steps is the difference from 2c steps; it falls with the eighth
         power of c. It is nan where no run reaches the end.
         """
-        study, tolerance = self.study, self.study.tolerance
-        count_of_rows, sampling = (
-            (PILOT, "random") if study.table is None else (study.rows, study.sampling)
-        )
-        chosen = np.linspace(0, count_of_rows - 1, min(PILOT, count_of_rows)).astype(
-            int
-        )
-        values = {
-            key: x[chosen] for key, x in study.draw(0, count_of_rows, sampling).items()
-        }
+        study = self.study
+        tolerance = study.tolerance
+        row_count = PILOT
+        sampling = "random"
+        if study.table is not None:
+            row_count = study.rows
+            sampling = study.sampling
+        spread = np.linspace(0, row_count - 1, min(PILOT, row_count))
+        chosen = spread.astype(int)
+        drawn = study.draw(0, row_count, sampling)
+        values = {key: numbers[chosen] for key, numbers in drawn.items()}
         scenarios, starts, _ = self.scenarios(values)
         rows = np.arange(len(chosen))
         unit = 1 if self.controlled is None else self.controlled.samples
         count = max(unit, 16)
         for _ in range(12):
-            coarse, fine = (
-                self.run(scenarios, starts, rows, n)[0] for n in (count, 2 * count)
-            )
+            coarse, _ = self.run(scenarios, starts, rows, count)
+            fine, _ = self.run(scenarios, starts, rows, 2 * count)
             completed = coarse.success & fine.success
             if not completed.any():
                 return count
             apart = angle_between(
                 coarse.quaternion[completed], fine.quaternion[completed]
             )
-            self.pilot_error = error = float(apart.max())
+            error = float(apart.max())
+            self.pilot_error = error
             if error <= tolerance:
                 return count
-            factor = (
-                (error / (0.7 * tolerance)) ** (1.0 / 8.0)
-                if math.isfinite(error)
-                else 4.0
-            )
+            factor = 4.0
+            if math.isfinite(error):
+                # Aim a little below the tolerance.
+                factor = (error / (0.7 * tolerance)) ** (1.0 / 8.0)
             count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
             if count > MOST_RUN_STEPS:
                 break
@@ -389,7 +395,8 @@ class PreparedSweep:
 
     def chunk(self, index: int) -> pa.Table:
         """Table of the rows of a chunk."""
-        pyarrow, study = require("pyarrow"), self.study
+        pyarrow = require("pyarrow")
+        study = self.study
         rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
         values = study.draw(int(rows[0]), len(rows))
         scenarios, starts, faults = self.scenarios(values)
@@ -455,15 +462,14 @@ class PreparedSweep:
         """
         batch = self.batch.with_parameters(scenarios)
         outputs = self.study.outputs
-        every = (
-            -(-steps // EXTREME_PARTS)
-            if "extremes" in outputs or "reactions" in outputs
-            else 0
-        )
+        every = 0
+        if "extremes" in outputs or "reactions" in outputs:
+            every = -(-steps // EXTREME_PARTS)  # rounded up
         if self.controlled is not None:
             result, over_time = self.controlled.run(batch, starts, rows, steps, every)
         else:
-            initial, over_time = self.study.scene.initial, {}
+            over_time = {}
+            initial = self.study.scene.initial
             gamma = starts.get("initial.gamma", np.array(initial.gamma))
             rate = starts.get("initial.gamma_dot", np.array(initial.gamma_dot))
             if scenarios.count is None:
@@ -521,9 +527,10 @@ class PreparedSweep:
         outside: dict[str, Array] = {}
         for variation in self.study.variations:
             for key, array in variation.parameters(values[variation.key]).items():
-                (outside if key.startswith(("initial.", "control.")) else inside)[
-                    key
-                ] = array
+                if key.startswith(("initial.", "control.")):
+                    outside[key] = array
+                else:
+                    inside[key] = array
         return inside, outside
 
 
@@ -714,15 +721,16 @@ def summarize(table: pd.DataFrame) -> str:
     statistics["unit"] = [
         table.attrs["units"].get(name, "") for name in statistics.index
     ]
+    statistics_text = ""
+    if len(outputs):
+        statistics_text = statistics.to_string(float_format="{:.6g}".format)
     return render(
         "sweep.txt",
         runs=len(table),
         about=table.attrs,
         reasons=table["reason"].value_counts(),
         causes=correlate(table).head(8).to_dict(),
-        outputs=statistics.to_string(float_format="{:.6g}".format)
-        if len(outputs)
-        else "",
+        outputs=statistics_text,
     )
 
 

@@ -59,9 +59,9 @@ They are a second of work, and a power of two, as Sobol points want.
 """
 
 SWEEP_OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
-"""What `outputs` may name: of the final state.
+"""What `outputs` may name.
 
-Extremes of joints and reactions over a run.
+Extremes of joints and reactions are those over a run, all else is of the final state.
 """
 
 MOST = 10_000_000
@@ -132,11 +132,12 @@ class SweepStudy(Section):
 
     def rules(self) -> Rules:
         """Refuse keys, outputs and torques that are none."""
-        mapping, torque = isinstance(self.vary, Mapping), self.torque
+        torque = self.torque
+        is_mapping = isinstance(self.vary, Mapping)
         requirement = (
             "must be a mapping from keys of the scene to distributions or values"
         )
-        yield not mapping, "vary", self.vary, requirement
+        yield not is_mapping, "vary", self.vary, requirement
         for name in self.outputs:
             yield (
                 name not in SWEEP_OUTPUTS,
@@ -164,16 +165,18 @@ class SweepStudy(Section):
 
         `scene` is a name, a path relative to the file, or a document.
         """
-        refused = "STUDY", str(path), "must be a readable .yaml file"
-        with refuse_errors("sweep", *refused, OSError, UnicodeDecodeError):
+        requirement = "must be a readable .yaml file"
+        unreadable = (OSError, UnicodeDecodeError)
+        with refuse_errors("sweep", "STUDY", str(path), requirement, *unreadable):
             source = read_file(path)
         values = read_values(source, str(path))
         mapping = isinstance(values, dict) and isinstance(values.get("vary", {}), dict)
         requirement = "must be a mapping with the keys scene and vary"
         refuse_unless(str(path), ("", type(values).__name__, mapping, requirement))
         # Sections take numbers as text; what only `rules` check has them as numbers.
-        for name in [name for name in ("vary", "table", "torque") if name in values]:
-            values[name] = resolve_numbers(values[name])
+        for name in ("vary", "table", "torque"):
+            if name in values:
+                values[name] = resolve_numbers(values[name])
         return cls.from_values(values, path.parent)
 
     @classmethod
@@ -205,8 +208,11 @@ class SweepStudy(Section):
             return self.scene
         # constant: a sine that stays at its largest value
         if not isinstance(torque, Mapping):
-            zeros, right = [0.0] * 3, [math.pi / 2] * 3
-            torque = {"amplitude": list(torque), "frequency": zeros, "phase": right}
+            torque = {
+                "amplitude": list(torque),
+                "frequency": [0.0] * 3,
+                "phase": [math.pi / 2] * 3,
+            }
         return self.scene.with_values({"torque": dict(torque)})
 
     @cached_property
@@ -228,9 +234,8 @@ class SweepStudy(Section):
         """What varies, key by key."""
         variations: list[Variation] = []
         problems = []
-        for key, distribution in {
-            str(key): distribution for key, distribution in self.vary.items()
-        }.items():
+        distributions = {str(key): value for key, value in self.vary.items()}
+        for key, distribution in distributions.items():
             try:
                 variations.append(read_variation(key, distribution, self._targets(key)))
             except (ValueError, TypeError, OverflowError, MemoryError) as error:
@@ -267,14 +272,13 @@ class SweepStudy(Section):
         requirement = "must have columns of equal length, and no grid beside it"
         refuse_unless("sweep", ("table", sorted(lengths), alone, requirement))
         natural = min(lengths, default=grid)
-        rows, is_given = self.n or natural, bool(self.n or lengths or grid > 1)
-        drawn, fits = (
-            any(variation.drawn for variation in self.variations),
-            not lengths or rows <= natural,
-        )
+        rows = self.n or natural
+        is_given = bool(self.n or lengths or grid > 1)
+        is_drawn = any(variation.drawn for variation in self.variations)
+        fits = not lengths or rows <= natural
         refuse_unless(
             "sweep",
-            ("n", self.n, is_given or not drawn, "must be given with distributions"),
+            ("n", self.n, is_given or not is_drawn, "must be given with distributions"),
             ("n", self.n, fits, f"must be <= {natural}, the rows of the table"),
             (
                 "n",
@@ -287,19 +291,20 @@ class SweepStudy(Section):
 
     def draw(self, first: int, count: int, sampling: str = "") -> dict[str, Array]:
         """Draw rows `first` to `first + count`: (count, components) by varied key."""
-        quantiles, used = self._quantiles(first, count, sampling or self.sampling), 0
-        drawn, index = {}, np.arange(first, first + count)
+        quantiles = self._quantiles(first, count, sampling or self.sampling)
+        drawn = {}
+        used = 0  # columns of the quantiles
         for variation in self.variations:
             if variation.drawn:
-                drawn[variation.key] = variation.values(
-                    quantiles[:, used : used + len(variation.columns)]
-                )
-                used += len(variation.columns)
+                width = len(variation.columns)
+                own_quantiles = quantiles[:, used : used + width]
+                drawn[variation.key] = variation.values(own_quantiles)
+                used += width
             else:
                 drawn[variation.key] = variation.numbers[first : first + count]
-        for variation in reversed(
-            self.variations
-        ):  # the last key of a grid varies fastest
+        index = np.arange(first, first + count)
+        # The last key of a grid varies fastest.
+        for variation in reversed(self.variations):
             if variation.kind == "grid":
                 drawn[variation.key] = variation.numbers[index % len(variation.numbers)]
                 index = index // len(variation.numbers)
@@ -337,7 +342,7 @@ class SweepStudy(Section):
     def document(self) -> dict[str, Any]:
         """Return the study as nested dicts and lists.
 
-        A table as digests of its columns.
+        A table is in it as digests of its columns.
         """
         values = self.__getstate__()
         if self.table is not None:

@@ -213,7 +213,9 @@ def _plot(
     lines: list[viser.uplot.Series] = [{"label": "t [s]"}]
     for k, colour in zip("₁₂₃", _COLOURS, strict=True):
         lines.append({"label": f"{label[0]}{k}", "stroke": colour, "width": 2.0})
-    low, high = ({"soft": value, "mode": 1, "pad": 0.1} for value in range_)
+    least, largest = range_
+    low = {"soft": least, "mode": 1, "pad": 0.1}
+    high = {"soft": largest, "mode": 1, "pad": 0.1}
     return server.gui.add_uplot(
         (np.array([0.0, 1.0]), *np.zeros((3, 2))),
         tuple(lines),
@@ -441,7 +443,7 @@ class SceneDrawing:
     ) -> viser.ArrowsHandle:
         """Add an arrow between two points.
 
-        Sizes of shaft and head are parts of the largest link's.
+        Sizes of shaft and head are shares of the larger radius, of base or star.
 
         viser takes linear colours for arrows, and sRGB for all else.
         """
