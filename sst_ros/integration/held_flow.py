@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import LEGS, ODE
+from sst_ros.integration.method_steps import LARGEST_SHRINKAGE, step_factor
 from sst_ros.integration.methods import DOP853
 from sst_ros.integration.steps import add_up, explicit_step
 from sst_ros.mechanism.generic_math import absolute, larger
@@ -35,12 +36,6 @@ _AT_STOPS = 0.1
 
 A step across a jump of derivatives loses its order.
 """
-_SAFETY = 0.9
-"""Share of the step that the error allows."""
-_LARGEST_GROWTH = 5.0
-"""Factor by which a step grows at most."""
-_LARGEST_SHRINKAGE = 0.2
-"""Factor by which it shrinks at most."""
 _SHORTEST = 1e-16
 """Share of the period below which no step resolves the motion."""
 
@@ -107,7 +102,7 @@ def follow_held_torque(
         rows[:, 0] = h
         results = step(rows)
         if not np.isfinite(results[:, -1]).all():
-            h *= _LARGEST_SHRINKAGE
+            h *= LARGEST_SHRINKAGE
             continue
         error = float(results[:, -2].max()) / tolerance
         if error <= 1.0:
@@ -115,7 +110,7 @@ def follow_held_torque(
             moving[:] = results[:, : 2 * size]
             times.append(t)
             states.append(moving[0, :size].copy())
-        h *= _change_of_step(error)
+        h *= step_factor(error, DOP853)
     by_number = moving[:, size:].T
     by_start, by_torque = by_number[:, :size], by_number[:, size:]
     return HeldFlow(np.array(times), np.array(states), by_start, by_torque)
@@ -193,11 +188,3 @@ def _compile_step(ode: ODE) -> RowsFunction:
     torque_rates = [f"r{i}" for i in range(LEGS)]
     program = trace(take_step, ("h", *state, *column, *drive, *torque_rates))
     return compile_rows({"tangent": ode.tangent, "step": program}, "step")
-
-
-def _change_of_step(error: float) -> float:
-    """Return the next step's factor by the last error, relative to the tolerance."""
-    if error == 0.0:
-        return _LARGEST_GROWTH
-    factor: float = _SAFETY * error ** (-1.0 / (DOP853.error_order + 1))
-    return min(max(factor, _LARGEST_SHRINKAGE), _LARGEST_GROWTH)

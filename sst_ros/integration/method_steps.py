@@ -44,6 +44,13 @@ JACOBIAN_COST = 30
 JOINT_NUMBERS = 18
 """Numbers of `joints`: nine angles and nine rates."""
 
+LARGEST_GROWTH = 5.0
+"""Factor by which a step grows at most: one small estimate may be chance."""
+LARGEST_SHRINKAGE = 0.2
+"""Factor by which it shrinks at most: an error far too large says little."""
+SAFETY = 0.9
+"""Share of the step that the error allows, so that few steps are rejected."""
+
 
 class MethodSteps:
     """Steps of an ODE under torques that are numbers, a sine, or a function of time.
@@ -294,3 +301,13 @@ def read_outcome(
         point.changes,
     )
     return Outcome(after, error if finite else math.inf, stages)
+
+
+def step_factor(error: float, method: Method) -> float:
+    """Return the next step's factor by a local error relative to the tolerance."""
+    if error == 0.0:
+        return LARGEST_GROWTH
+    if not error < math.inf:
+        return LARGEST_SHRINKAGE
+    factor: float = SAFETY * error ** (-1.0 / (method.error_order + 1))
+    return min(max(factor, LARGEST_SHRINKAGE), LARGEST_GROWTH)

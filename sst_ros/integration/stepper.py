@@ -48,7 +48,13 @@ from sst_ros.integration.function_steps import (
     FunctionSteps,
     TimeSteps,
 )
-from sst_ros.integration.method_steps import JACOBIAN_COST, MethodSteps, steps_of
+from sst_ros.integration.method_steps import (
+    JACOBIAN_COST,
+    SAFETY,
+    MethodSteps,
+    step_factor,
+    steps_of,
+)
 from sst_ros.integration.methods import (
     DOP853,
     DORMAND_PRINCE,
@@ -73,12 +79,6 @@ WHOLE_MOTION_BUDGET = 10_000_000
 They take minutes in plain Python.
 """
 
-_LARGEST_GROWTH = 5.0
-"""Factor by which a step grows at most: one small estimate may be chance."""
-_LARGEST_SHRINKAGE = 0.2
-"""Factor by which it shrinks at most: an error far too large says little."""
-_SAFETY = 0.9
-"""Share of the step that the error allows, so that few steps are rejected."""
 _LAST_SLIVER = 1e-3
 """A step also takes the rest of a period that is shorter than this share of it."""
 _SHORTEST_STEP = 1e-15
@@ -416,7 +416,7 @@ class Stepper:
                 stopped = bool(stops) and h == stops[0] - t
                 longest = _next_length(point, h, error, cut=stopped or h == left)
                 if passed > 0.0:  # the next step is not to be refused for a leap
-                    longest = min(longest, _SAFETY * h / passed)
+                    longest = min(longest, SAFETY * h / passed)
                 counts_attempt = self._chooses and (
                     h < left or isinstance(point.method, Rosenbrock)
                 )
@@ -437,7 +437,7 @@ class Stepper:
             if stops:
                 point = point._replace(h=h)
                 continue
-            point = point._replace(h=h * min(_step_factor(error, point.method), 1.0))
+            point = point._replace(h=h * min(step_factor(error, point.method), 1.0))
             if point.h < _SHORTEST_STEP * max(abs(t), end - t) or point.h < 1e-200:
                 raise CannotStep(f"steps of {point.h:.1e} s do not resolve it")
             rejected += 1
@@ -624,15 +624,5 @@ def _next_length(point: Point, h: float, error: float, *, cut: bool) -> float:
     The error is relative to the tolerance. A step that was cut does not say that the
     next must be shorter than the longest of before.
     """
-    length = h * _step_factor(error, point.method)
+    length = h * step_factor(error, point.method)
     return max(point.h, length) if cut else length
-
-
-def _step_factor(error: float, method: Method) -> float:
-    """Return the next step's factor by a local error relative to the tolerance."""
-    if error == 0.0:
-        return _LARGEST_GROWTH
-    if not error < math.inf:
-        return _LARGEST_SHRINKAGE
-    factor: float = _SAFETY * error ** (-1.0 / (method.error_order + 1))
-    return min(max(factor, _LARGEST_SHRINKAGE), _LARGEST_GROWTH)
