@@ -19,6 +19,7 @@ from sst_ros.code_generation.python_module import LIBRARIES, python_module
 from sst_ros.description.mjcf import mjcf
 from sst_ros.errors import check_kinds, refuse_unless, require
 from sst_ros.files import replace_file, require_free, write_into
+from sst_ros.programs.expression import execute
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import Explained, cached_property
 
@@ -91,7 +92,7 @@ class Equations(Explained):
         require(self.target)
         (name, text), *_ = self.files.items()
         functions: dict[str, Any] = {"__name__": Path(name).stem}
-        exec(compile(text, name, "exec"), functions)
+        execute(text, functions, name)
         return functions
 
     def _facts(self) -> dict[str, object]:

@@ -9,7 +9,7 @@ it is cut into segments.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
@@ -92,10 +92,6 @@ class MeasuredMotion(Section):
             array = getattr(self, name)
             wrong = array is not None and len(array) != count
             yield wrong, name, np.shape(array), f"must have the shape {count, 3}"
-
-    def with_torque(self, change: Callable[[Array], Array]) -> MeasuredMotion:
-        """Return the motion with changed torques [N m], shape (n, 3)."""
-        return replace(self, torque=change(self.torque))
 
 
 class Segments(NamedTuple):

@@ -559,13 +559,15 @@ def _program_of(
     return Program(names, steps, ()).prune([operand(result) for result in results])
 
 
-def execute(text: str, names: dict[str, Any]) -> None:
-    """Execute the text of a program with its names.
+def execute(
+    text: str | bytes, names: dict[str, Any], origin: str = "<program>"
+) -> None:
+    """Execute the text of a program with its names; a traceback calls it `origin`.
 
     The text is compiled first: where Ctrl-C comes in the `exec` of a text, CPython ends
     with the signal as its status, even if the KeyboardInterrupt is caught.
     """
-    exec(compile(text, "<program>", "exec"), names)
+    exec(compile(text, origin, "exec"), names)
 
 
 def compile_program(
