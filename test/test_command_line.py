@@ -182,10 +182,15 @@ def error_of(words, capsys):
         (["scene", "show", "nowhere"], "must be a readable .yaml file or one of"),
         (["report", "accuracy", "nowhere"], "must be a readable .yaml file or one of"),
         (["plan", "check", "spiral", "--csv", "{here}"], "--csv"),
-        (["plan", "check", "spiral", "--force", "--csv", "{here}"], "Is a directory"),
-        (
+        pytest.param(
+            ["plan", "check", "spiral", "--force", "--csv", "{here}"],
+            "Is a directory",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
             ["plan", "check", "spiral", "--csv", "/proc/torques.csv"],
             "/proc/torques.csv",
+            marks=pytest.mark.slow,
         ),
         (["demo", "--out", "/etc/passwd"], "exists already"),
         (["demo", "--force", "--out", "/etc/passwd"], "Not a directory"),
@@ -293,7 +298,9 @@ NEEDED = {
 @pytest.mark.parametrize(
     ("line", "modules"),
     [
-        pytest.param(line, name, marks=pytest.mark.slow if number else ())
+        pytest.param(
+            line, name, marks=pytest.mark.slow if number or "|" in name else ()
+        )
         for name, lines in NEEDED.items()
         for number, line in enumerate(lines)
     ],

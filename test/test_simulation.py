@@ -13,6 +13,7 @@ import pytest
 from loaded_scenes import IGNORE, REST
 from models import seeded_samples
 from programs import python
+from slow_cases import slow_after
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import kinetic_energy
@@ -244,7 +245,9 @@ ALIKE = {
 }
 
 
-@pytest.mark.parametrize(("scene", "torque", "within"), ALIKE.values(), ids=ALIKE)
+@pytest.mark.parametrize(
+    ("scene", "torque", "within"), slow_after(3, ALIKE.values()), ids=ALIKE
+)
 def test_a_torque_moves_as_its_function_does(scene, torque, within):
     one, other = Simulation(scene), Simulation(scene)
     one.steps(torque, 10 * MILLISECOND, 50)

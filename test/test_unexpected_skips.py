@@ -41,7 +41,7 @@ MODULE = "import pytest\npytest.importorskip('no_such_module')\n"
         (TEST.format(reason="llvmlite is missing"), "true", (), 1),
         pytest.param(
             *(TEST.format(reason="llvmlite is missing"), "true", ("-n", "1"), 1),
-            marks=needs_workers,
+            marks=[needs_workers, pytest.mark.slow],
         ),
         (TEST.format(reason="llvmlite is missing"), "false", (), 0),
         (MODULE, "true", (), 1),

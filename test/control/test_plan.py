@@ -117,6 +117,7 @@ def test_demands_of_one_degree_of_freedom_are_its_closed_form():
         assert round(peaks["acceleration"].time, 6) in at
 
 
+@pytest.mark.slow
 @FAST
 @given(st.floats(0.0, 6.3), st.floats(0.5, 12.0), st.integers(40, 90))
 def test_extremes_between_samples_are_found(phase, frequency, count):
@@ -215,6 +216,7 @@ def resonant(factor=1.0):
     return replace(EXAMPLE1, springs=springs, actuators=actuators, motion=motion)
 
 
+@pytest.mark.slow
 def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible():
     """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points.
 

@@ -236,6 +236,7 @@ def test_sensitivities_by_a_parameter_of_an_own_load():
     assert np.abs(found - expected).max() < 1e-7 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_motions_under_own_loads_are_proven():
     scene = replace(load_scene("general"), own_loads=windy().own_loads)
     proven = certify(scene, (0.2, 0.0, 0.0), 0.02, bound=1e-6, progress=False)

@@ -252,6 +252,7 @@ def test_a_recording_is_fitted_by_simulation(written, tmp_path, capsys, actuator
     assert "takes no cutoff" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_scene_becomes_a_motion(tmp_path, capsys):
     out = tmp_path / "exciting.yaml"
     words = ["identify", "design", "example2", "--duration", "1", "--harmonics", "3"]

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from slow_cases import slow_after
 
 from sst_ros import simulate
 
@@ -132,7 +133,7 @@ def test_eight_cold_threads_have_the_bits_of_one(repeat):
     assert run_code(BEGIN + THREADS) == ["8", bits_here()]
 
 
-@pytest.mark.parametrize("home", [None, "/nonexistent", "/proc"])
+@pytest.mark.parametrize("home", slow_after(1, [None, "/nonexistent", "/proc"]))
 def test_no_home_is_needed(home):
     assert run_code(BEGIN + "print(bits())", HOME=home) == [bits_here()]
 

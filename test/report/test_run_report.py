@@ -140,6 +140,7 @@ def test_the_pictures_are_pictures(whole):
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 500
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     out = tmp_path / "out"
     kept = bags.without(lively, bags.DIAGNOSTICS, bags.EULER)

@@ -200,6 +200,7 @@ def test_a_setting_counts_only_if_every_finer_one_is_as_good(short, errors, chos
     )
 
 
+@pytest.mark.slow
 def test_another_inertia_in_the_runs_is_seen(monkeypatch):
     """A part in 1e7 of the star's inertia: no method gets near the reference."""
     inertia = dataclasses.asdict(SHORT.star.inertia)

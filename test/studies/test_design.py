@@ -35,6 +35,7 @@ def test_the_workspace_is_the_share_of_random_orientations():
     assert found.conditioning == pytest.approx(index, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_random_parts():
     """Assemblies of 2,000 manipulators with errors of all places, at the same measured
     angles.
