@@ -299,7 +299,7 @@ NEEDED = {
     ("line", "modules"),
     [
         pytest.param(
-            line, name, marks=pytest.mark.slow if number or "|" in name else ()
+            line, name, marks=pytest.mark.slow if number or name != "rclpy" else ()
         )
         for name, lines in NEEDED.items()
         for number, line in enumerate(lines)
@@ -398,6 +398,7 @@ def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsy
     assert said.err == ""
 
 
+@pytest.mark.slow
 def test_the_workspace_of_a_scene_is_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["workspace", "example2"]) == 0

@@ -76,6 +76,7 @@ print(*sorted(set(sys.modules) - before))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "torque"),
     slow_after(1, [("example2_heavy", 50.0), ("elastic_stops", 1.0)]),

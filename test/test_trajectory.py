@@ -181,6 +181,7 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(run, path, flips):
     assert refused > flips * 2 / 3
 
 
+@pytest.mark.slow
 def test_parallel_saves_to_one_path_never_break_a_reader(run, path):
     motions = run, run.at(run.t[::2])
     run.save(path)

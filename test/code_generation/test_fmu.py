@@ -206,6 +206,7 @@ def test_fmpy_finds_the_unit_valid(scene, tmp_path):
     assert validate_fmu(str(path)) == []
 
 
+@pytest.mark.slow
 def test_equal_scenes_give_equal_bytes_and_others_another_token(tmp_path):
     first, again = (equations("example2", "fmu").files for _ in range(2))
     assert first == again

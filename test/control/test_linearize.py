@@ -123,6 +123,7 @@ def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
         assert np.abs(matrix - truth).max() <= 1e-10 * np.abs(truth).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 6))]
 )

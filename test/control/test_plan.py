@@ -325,6 +325,7 @@ def test_the_command_tells_verdict_and_status(capsys, tmp_path):
     assert "--period = 0.0" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_json_says_what_the_table_says(capsys):
     assert cli.main(["plan", "check", "point_to_point", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -361,6 +362,7 @@ def test_written_torques_do_the_motion(tmp_path):
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_peaks_of_reactions_are_those_of_a_fine_sampling():
     scene = load("reach")
     plan = examine_motion(reference_motion(scene), scene)

@@ -226,6 +226,7 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "actuators",
     [pytest.param(None, marks=pytest.mark.slow), Actuators(time_constant=0.02)],

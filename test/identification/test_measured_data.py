@@ -114,6 +114,7 @@ def test_noise_is_found():
     )
 
 
+@pytest.mark.slow
 def test_noise_may_be_given():
     case = measured()
     found = identify(case.recording(0), case.model)

@@ -138,6 +138,7 @@ def test_a_motion_with_gaps_is_cut_into_segments_with_a_word():
     assert np.abs(plant().errors(found)).max() < 5.0
 
 
+@pytest.mark.slow
 def test_seconds_since_the_epoch_and_wraps_are_taken_with_a_word():
     data = measure(6)
     expected = identify(data, plant().model)

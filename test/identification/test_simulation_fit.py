@@ -186,6 +186,7 @@ def test_the_torques_of_a_trajectory_lag_once(torque):
     assert found.values == pytest.approx([0.1], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "torque", [(3.0, -2.0, 1.0), pytest.param(None, marks=pytest.mark.slow)]
 )

@@ -400,6 +400,7 @@ def test_a_scenario_that_ends_early_has_its_last_states_time(swarm):
     assert np.all(np.isnan(result.gamma[7]))
 
 
+@pytest.mark.slow
 def test_tables_have_units_and_a_row_a_scenario(swarm):
     result = swarm.result
     pytest.importorskip("pandas", reason="tables need pandas")

@@ -63,6 +63,7 @@ def test_a_robot_that_ends_waits_until_it_is_reset():
     assert session.fault_time[4] == pytest.approx(alone.fault_time[0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_threads_and_other_numbers_of_robots_change_no_bit():
     many, few = starts(2000), 5
     session, alone = (

@@ -124,6 +124,7 @@ def test_three_contacts_at_once_bounce_as_one_freedom_does(stiffness, restitutio
     assert joints.gamma_dot[0] == pytest.approx(y[1], abs=2e-9)
 
 
+@pytest.mark.slow
 def test_stiff_stops_have_the_restitution_at_the_impact_rate():
     """The relation is exact for a constant inertia: the depth of contact is what
     remains.

@@ -362,6 +362,7 @@ def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(
     pair, bags, example2, tmp_path
 ):

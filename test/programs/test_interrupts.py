@@ -84,7 +84,7 @@ On an idle one it takes some hundredths of a second.
 """
 
 
-@pytest.mark.parametrize("name", slow_except(["simulate", "control period"], CALLS))
+@pytest.mark.parametrize("name", slow_except(["simulate"], CALLS))
 def test_ctrl_c_ends_a_call(name):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"needs {NEEDS[name]}")

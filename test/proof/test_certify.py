@@ -77,7 +77,7 @@ def case(name):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=[pytest.mark.slow] * (x == "friction")) for x in CASES],
+    slow_after(1, CASES),
 )
 def test_a_solution_of_60_digits_lies_inside(name):
     scene, torque = case(name)
@@ -316,6 +316,7 @@ def test_a_halved_defect_misses_a_motion_of_60_digits(monkeypatch):
     assert min(found()) > 1.8
 
 
+@pytest.mark.slow
 def test_a_wrong_jacobian_misses_a_motion_of_60_digits(monkeypatch):
     scene, _ = case("general")
     rates = tuple(

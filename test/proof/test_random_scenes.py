@@ -71,6 +71,7 @@ def compare(number):
     return *ratios, all(rates)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", slow_after(1, [0, 101]))
 def test_a_random_motion_lies_inside(number):
     table, simulated, rates = compare(number)

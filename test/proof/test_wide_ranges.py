@@ -155,6 +155,7 @@ def test_a_geometry_that_is_none_is_refused_with_a_width():
     assert "too wide" in wider.reason
 
 
+@pytest.mark.slow
 def test_the_width_and_split_that_are_advised_would_do():
     times = {"duration": 0.1, "t_eval": [0.1]}
     proven = certify("general", ranges={"star.alpha_deg[0]": 0.2}, **times)

@@ -378,6 +378,7 @@ def test_printed_shares_are_rounded_outward():
     assert Decimal(number) >= Decimal(math.degrees(zone.nearest.distance))
 
 
+@pytest.mark.slow
 def test_directions_are_shown_on_the_triangle():
     scene = load_scene("general")
     zone = certify_zone(scene, tilt=0.5, torsion=1.0, max_boxes=20_000)

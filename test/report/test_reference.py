@@ -230,6 +230,7 @@ def from_topic(entries):
     return edited(entries, SCENE, -1, lambda message: replace(message, data=text))
 
 
+@pytest.mark.slow
 def test_a_recorded_moment_is_used(recorded):
     moment = PUSHED.moment.value
     run = recorded(

@@ -132,6 +132,7 @@ def test_a_run_beside_a_singularity_starts_beside_it():
     assert min(abs(measured.det_j1), abs(measured.det_j2)) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_steps_are_those_of_the_eigenvalues(found):
     assert len(found.steps) == 50 and found.steps.t_s.iloc[-1] == EXAMPLE2.duration
     assert (found.steps.rodas5p == math.inf).all()

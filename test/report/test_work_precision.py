@@ -66,6 +66,7 @@ def _rows(found, method, kind=FIXED):
     return list(rows[(rows.method == method) & (rows.kind == kind)].itertuples())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
 def test_the_reference_is_mpmaths_and_better_than_doubles(short):
     """At the same steps, so that only the arithmetic differs."""

@@ -22,6 +22,7 @@ from studies.design import (
 DESIGN = Design(85.0, 95.0, 80.0, 110.0, 130.0, 1.2)
 
 
+@pytest.mark.slow
 def test_the_workspace_is_the_share_of_random_orientations():
     geometry, found = Geometry.of(DESIGN.scene()), evaluate(DESIGN)
     rotation = Rotation.random(

@@ -76,6 +76,7 @@ def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
         assert done.error.time == pytest.approx(case.stop_time(), rel=1e-10, abs=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     slow_after(

@@ -52,7 +52,7 @@ def gaussian(seed, rows, counter):
 
 @pytest.mark.parametrize("by", ["NumPy", "machine code"])
 @pytest.mark.parametrize(
-    "case", slow_after(2, CASES), ids=lambda case: "-".join(map(str, case.values()))
+    "case", slow_after(1, CASES), ids=lambda case: "-".join(map(str, case.values()))
 )
 def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
     if by == "NumPy":
