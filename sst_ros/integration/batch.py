@@ -43,7 +43,16 @@ from sst_ros.programs.llvm import LANES
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import FULL_TURN
-from sst_ros.state import Explained, cached_property, freeze
+from sst_ros.state import (
+    LAGGED_TORQUES,
+    QUATERNION,
+    STAR,
+    STAR_RATE,
+    TORQUES,
+    Explained,
+    cached_property,
+    freeze,
+)
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -247,7 +256,7 @@ class Batch(Explained):
         steps[code < 0] = 0
         locate_ends(loop, step, steps, y, drives, code, time)
         last = steps * step
-        facts = self.model, self.columns, drives[:3].T, code, time, error
+        facts = self.model, self.columns, drives[TORQUES].T, code, time, error
         result = BatchResult(*facts, last, y)
         if keep_every:
             samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
@@ -286,7 +295,7 @@ class Batch(Explained):
 
         """
         requirement = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
-        torque = self.model.ode.drive[:3] == TORQUE_SYMBOLS
+        torque = self.model.ode.drive[TORQUES] == TORQUE_SYMBOLS
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
@@ -333,7 +342,7 @@ class Batch(Explained):
             )
             code[outside.any(axis=1)] = OUTSIDE_STATUS
         y = np.zeros((len(self.model.ode.state), len(angles)))
-        y[:7] = start
+        y[STAR] = start
         if alike and count:
             y = np.repeat(y, count, axis=1)
             code = np.repeat(code, count)
@@ -344,9 +353,11 @@ class Batch(Explained):
         drive = self.model.ode.drive
         columns = self.columns.inputs
         drive_rows = np.zeros((max(len(drive) + len(columns), 1), number))
-        if drive[:3] == TORQUE_SYMBOLS:
+        if drive[TORQUES] == TORQUE_SYMBOLS:
             limit = self.columns.torque_limit
-            drive_rows[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
+            drive_rows[TORQUES] = np.clip(
+                _rows("torque", torque, number).T, -limit, limit
+            )
         drive_rows[len(drive) : len(drive) + len(columns)] = columns
         return drive_rows
 
@@ -468,8 +479,8 @@ class BatchResult(MotionTable):
         )
         self.t = t
         self._state = np.moveaxis(y, -2, -1)
-        self.quaternion: Array = self._state[..., :4]
-        self.body_rate: Array = self._state[..., 4:7]
+        self.quaternion: Array = self._state[..., QUATERNION]
+        self.body_rate: Array = self._state[..., STAR_RATE]
         self.kept: BatchResult | None = None
         # torques of a controller, where they are not `torque`
         self.sent: Array | None = None
@@ -485,7 +496,7 @@ class BatchResult(MotionTable):
         if name not in self._computed:
             function = self._model.outputs[name]
             inputs = self._columns.inputs
-            states = np.moveaxis(self._state, -1, 0)[:7]
+            states = np.moveaxis(self._state, -1, 0)[STAR]
             count = self.t.shape[-1]
             components = np.empty((1 if name == "energy" else 3, *self.t.shape))
             size = max(1, _BATCH_BLOCK * count // max(self.t.size, 1))
@@ -503,7 +514,7 @@ class BatchResult(MotionTable):
     def torque(self) -> Array:
         """Torques that act at the actuators [N m], shape (..., N, 3)."""
         if self._state.shape[-1] > 7:
-            return self._state[..., 7:10]
+            return self._state[..., LAGGED_TORQUES]
         if self.sent is not None:
             return self.sent
         profile = self._model.constants(list(self._columns.inputs)).torque

@@ -36,7 +36,7 @@ from sst_ros.programs.compiled import (
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
-from sst_ros.state import cached_property
+from sst_ros.state import STAR, cached_property
 
 JACOBIAN_COST = 30
 """Measured cost of a Jacobian with factorisation, in evaluations of plain Python."""
@@ -257,7 +257,7 @@ def trace_steps(
             return NewState([*results[:size]], [*results[size:]] or None)
 
         pair = step_pair(call, t, h, y, z, lagged)
-        angles = joints(*pair.y[:7])
+        angles = joints(*pair.y[STAR])
         total = pair.total + add_up(angles)
         return (*pair.y, *pair.z, *angles, pair.size, total)
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Method
 from sst_ros.scene.torque_profile import SineTorque, TorqueProfile
+from sst_ros.state import QUATERNION, STAR_RATE
 
 _ERROR_MARGIN = 2.0
 """Factor on the distance of both solutions.
@@ -56,8 +57,8 @@ class Point(NamedTuple):
     @property
     def rate_error(self) -> float:
         """Estimated global error of the body rate [rad/s]."""
-        speed = max(1.0, math.hypot(*self.y[4:7]))
-        distance = math.dist(self.y[4:7], self.z[4:7]) / speed
+        speed = max(1.0, math.hypot(*self.y[STAR_RATE]))
+        distance = math.dist(self.y[STAR_RATE], self.z[STAR_RATE]) / speed
         return speed * estimate_error(distance, self.steps)
 
 
@@ -71,7 +72,9 @@ def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
 
     q and -q are the same.
     """
-    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
+    q = y[QUATERNION]
+    p = z[QUATERNION]
+    return 2.0 * min(math.dist(q, p), math.dist(q, [-x for x in p]))
 
 
 def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
@@ -80,8 +83,9 @@ def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
     That of the rest is relative to the rate. Rates below 1 rad/s count as 1 rad/s;
     infinite where a number is not finite.
     """
-    speed = max(1.0, math.hypot(*z[4:7]))
-    distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)
+    speed = max(1.0, math.hypot(*z[STAR_RATE]))
+    distance_of_others = math.dist(y[STAR_RATE.start :], z[STAR_RATE.start :])
+    distance = max(orientation_distance(y, z), distance_of_others / speed)
     return distance if math.isfinite(distance) else math.inf
 
 

@@ -34,7 +34,7 @@ from sst_ros.dynamics.model import (
     ranges_of,
     transitions_of,
 )
-from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.dynamics.traced_dynamics import STATE_SIZE, Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.events import (
     all_far,
@@ -64,10 +64,11 @@ from sst_ros.integration.methods import (
     Rosenbrock,
 )
 from sst_ros.integration.point import Drive, MethodChange, Point, Step
+from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import ConstantTorque, SineTorque, Torque
-from sst_ros.state import Vector3
+from sst_ros.state import LAGGED_TORQUES, MOMENT, STAR, Vector3
 
 Moment = tuple[float, ...]
 """External moment on the star in {B} [N m] from a topic of the scene, else empty."""
@@ -241,14 +242,16 @@ class Stepper:
         first of those that it may use.
         """
         full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
-        joints = tuple(self.dynamics.joints(*full[:7]))
+        joints = tuple(self.dynamics.joints(*full[STAR]))
         return Point(full, list(full), joints, method or self._methods[0])
 
     def load(self) -> None:
         """Have the code compiled that periods under constant torques may need."""
         import scipy.optimize  # noqa: F401  # takes 0.4 s, too long for a step in real time
 
-        drive = self._hold((0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[3:]))
+        drive = self._hold(
+            (0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[MOMENT])
+        )
         for method in self._methods if self._chooses else self._methods[:1]:
             self._steps_of(drive, method).load()
         if self._chooses:
@@ -256,8 +259,8 @@ class Stepper:
 
     def acting(self, torque: Torque, time: float, point: Point) -> Vector3:
         """Torques that the actuators give at a time [s] and a point [N m]."""
-        if len(self.dynamics.state) > 7:  # they lag
-            return point.y[7], point.y[8], point.y[9]
+        if len(self.dynamics.state) > STATE_SIZE:  # they lag
+            return triple(point.y[LAGGED_TORQUES])
         return self.torque.at(torque, time, point.y)
 
     def advance(
@@ -554,7 +557,7 @@ class Stepper:
                 return end
             self.budget.charge(step.steps.cost)
             state = step.inside(x)
-            inside = self.dynamics.joints(*state[:7])
+            inside = self.dynamics.joints(*state[STAR])
             if not math.isfinite(sum(state) + sum(inside)):
                 raise _NoState
             return inside

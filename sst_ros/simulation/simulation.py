@@ -44,6 +44,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.state import (
     NANOSECONDS,
+    STAR_RATE,
     ZERO,
     Explained,
     State,
@@ -407,7 +408,7 @@ class Simulation(Explained):
         moment = (instant.moment or ZERO) if self.dynamics.has_moment_topic else ()
         state = instant.point.y[: len(self.dynamics.state)]
         slope = self.dynamics.derivative(*state, *self._torque(instant), *moment)
-        return triple(slope[4:7])
+        return triple(slope[STAR_RATE])
 
     @property
     def time_ns(self) -> int:
