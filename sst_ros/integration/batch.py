@@ -33,6 +33,7 @@ from sst_ros.integration.batch_step import (
     Advance,
     Block,
     ColumnStep,
+    Endings,
     advance_blocks,
     locate_ends,
 )
@@ -157,17 +158,12 @@ class Batch(Explained):
             self._scenarios.rows,
         )
 
-    def result_of(
-        self, code: NDArray[np.int64], fault_time: Array, error: Array, t: Array,
-        torque: Array, y: Array,
-    ) -> BatchResult:  # fmt: skip
+    def result_of(self, endings: Endings, t: Array, y: Array) -> BatchResult:
         """Return the states of all scenarios as a `BatchResult`.
 
         See there for the arguments.
         """
-        return BatchResult(
-            self.model, self.columns, torque, code, fault_time, error, t, y
-        )
+        return BatchResult(self.model, self.columns, endings, t, y)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios that shares this one's programs.
@@ -256,11 +252,11 @@ class Batch(Explained):
         steps[code < 0] = 0
         locate_ends(loop, step, steps, y, drives, code, time)
         last = steps * step
-        facts = self.model, self.columns, drives[TORQUES].T, code, time, error
-        result = BatchResult(*facts, last, y)
+        endings = Endings(drives[TORQUES].T, code, time, error)
+        result = self.result_of(endings, last, y)
         if keep_every:
             samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
-            result.kept = BatchResult(*facts, samples, np.stack(kept))
+            result.kept = self.result_of(endings, samples, np.stack(kept))
         return result
 
     def _facts(self) -> dict[str, object]:
@@ -459,21 +455,19 @@ class BatchResult(MotionTable):
         self,
         model: ParametricModel,
         columns: ParameterColumns,
-        torque: Array,  # commanded, shape (N, 3); not used under a profile
-        code: NDArray[np.int64],
-        fault_time: Array,
-        local_error: Array,
+        endings: Endings,
         t: Array,  # shape (N,) or (samples, N)
         y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
     ) -> None:
         self._model = model
         self._columns = columns
-        self._torque = torque
+        self._torque = endings.torque
         self.scene = model.scene
         self._axes = ("time", "scenario") if t.ndim == 2 else ("scenario",)
+        code = endings.code
         self.code = code
-        self.fault_time = fault_time
-        self.local_error = local_error
+        self.fault_time = endings.fault_time
+        self.local_error = endings.local_error
         self.status = np.where(
             (code < 0) | (code == NOT_FINITE_CODE), -1, np.sign(code)
         )

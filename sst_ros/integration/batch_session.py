@@ -20,6 +20,7 @@ from sst_ros.errors import check_kinds, check_kinds_late, refuse_unless
 from sst_ros.integration.batch_step import (
     EARLIEST,
     Block,
+    Endings,
     locate_ends,
     spaced_rows,
 )
@@ -210,9 +211,8 @@ class BatchSession:
         fault = self.fault_time.copy()
         torque = self._drives[TORQUES].T.copy()
         last = np.where(np.isnan(fault), time, fault)
-        return batch.result_of(
-            code, fault, self._error.copy(), last, torque, self._y.copy()
-        )
+        endings = Endings(torque, code, fault, self._error.copy())
+        return batch.result_of(endings, last, self._y.copy())
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""

@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,15 @@ _NO_SHARE = 2.0
 
 _EVENT_HALVINGS = 52
 """Of a step, until the share is known to all digits of a double."""
+
+
+class Endings(NamedTuple):
+    """How N scenarios ended; `BatchResult` says what the numbers mean."""
+
+    torque: Array  # commanded last [N m], shape (N, 3); not used under a profile
+    code: NDArray[np.int64]  # shape (N,), as are the others
+    fault_time: Array  # [s]
+    local_error: Array
 
 
 class ColumnStep:

@@ -396,6 +396,13 @@ class FeedbackSteps(FunctionSteps):
     def _functions(self) -> dict[str, Function]:
         return compile_stages(self._ode, self.method)
 
+    @cached_property
+    def _stages(self) -> list[tuple[float, Function]]:
+        """Node and compiled part of each stage."""
+        functions = self._functions
+        nodes = self.method.c
+        return [(node, functions[f"stage{k}"]) for k, node in enumerate(nodes)]
+
     def load(self) -> None:
         """Have the code compiled that a run calls."""
         _ = self._functions
@@ -448,7 +455,6 @@ class FeedbackSteps(FunctionSteps):
 
         `joints` are those of y.
         """
-        functions = self._functions
         size = self._size
         moment = drive.numbers[MOMENT]
         evaluate = self._torque.of_state
@@ -458,12 +464,10 @@ class FeedbackSteps(FunctionSteps):
         slopes: list[float] = []
         point = y
         numbers: list[float] = []
-        for number, node in enumerate(self.method.c):
+        for node, take_stage in self._stages:
             time = t + node * h if node else t
             torque = evaluate(function, start + time, point, joints)
-            numbers = functions[f"stage{number}"](
-                time, h, *y, *slopes, *point, *torque, *moment
-            )
+            numbers = take_stage(time, h, *y, *slopes, *point, *torque, *moment)
             slopes += numbers[:size]
             point = numbers[size : 2 * size]
             joints = numbers[2 * size :]

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Method
-from sst_ros.scene.torque_profile import SineTorque, TorqueProfile
-from sst_ros.state import QUATERNION, STAR_RATE
+from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile
+from sst_ros.state import QUATERNION, STAR_RATE, Vector3
 
 _ERROR_MARGIN = 2.0
 """Factor on the distance of both solutions.
@@ -89,6 +89,18 @@ def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
     return distance if math.isfinite(distance) else math.inf
 
 
+class Period(NamedTuple):
+    """A stretch of time: a tick, a control period, or a whole smooth motion."""
+
+    start: float  # when it begins [s]
+    h: float  # its length [s]
+    torque: Torque  # one of `AppliedTorque.acting`
+    moment: tuple[float, ...] = ()
+    """External moment on the star in {B} [N m], empty where no topic gives one."""
+    second_torque: Vector3 | None = None
+    """Constant torques of the second solution [N m], None where they are the same."""
+
+
 class Drive(NamedTuple):
     """What acts from outside over a period."""
 
@@ -99,6 +111,13 @@ class Drive(NamedTuple):
     function: TorqueProfile | None = None  # torques that the steps evaluate
     start: float = 0.0  # time of the run at which that of the steps is zero [s]
     sine: SineTorque | None = None  # torques that are part of the traced equations
+
+
+class Drives(NamedTuple):
+    """What acts on both solutions."""
+
+    first: Drive
+    second: Drive | None  # None where it is the same
 
 
 class Outcome(NamedTuple):

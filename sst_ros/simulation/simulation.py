@@ -22,7 +22,7 @@ from sst_ros.errors import (
     refuse_unless,
 )
 from sst_ros.integration.methods import AUTO, METHODS, RK4, Rosenbrock
-from sst_ros.integration.point import MethodChange, Point
+from sst_ros.integration.point import MethodChange, Period, Point
 from sst_ros.integration.stepper import (
     BudgetSpent,
     CannotStep,
@@ -311,7 +311,7 @@ class Simulation(Explained):
                 # Take steps of the integrator up to the end of the period.
                 try:
                     point = self._stepper.advance(
-                        instant.point, start, h, torque, acting_moment
+                        instant.point, Period(start, h, torque, acting_moment)
                     )
                 except (LimitReached, CannotStep) as stop:
                     raise self._explain(stop, start) from None
@@ -354,7 +354,8 @@ class Simulation(Explained):
         h = (time_ns - began) / NANOSECONDS
         torque = self._current.torque
         moment = self._current.moment
-        point = self._stepper.advance(self._before.point, start, h, torque, moment)
+        period = Period(start, h, torque, moment)
+        point = self._stepper.advance(self._before.point, period)
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
     def reset(self) -> State:

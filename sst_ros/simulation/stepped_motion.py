@@ -18,7 +18,7 @@ import numpy as np
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import AUTO, DOP853, Method
-from sst_ros.integration.point import Point, Step, state_distance
+from sst_ros.integration.point import Period, Point, Step, state_distance
 from sst_ros.integration.stepper import (
     ACCURATE,
     CannotStep,
@@ -184,15 +184,8 @@ class SteppedMotion:
         self._segment = begin, end
         self._torque = self.stepper.torque.acting(torque)
         self._take_if_wanted(begin, self.point.y)
-        self.stepper.advance(
-            self.point,
-            begin,
-            h,
-            self._torque,
-            self._moment,
-            other=self._second_torque,
-            visit=self._pass,
-        )
+        period = Period(begin, h, self._torque, self._moment, self._second_torque)
+        self.stepper.advance(self.point, period, visit=self._pass)
 
     def _pass(self, step: Step) -> None:
         """Take the samples in a step, and note where the motion stands."""
