@@ -24,6 +24,25 @@ Quaternion: TypeAlias = tuple[float, float, float, float]  # (x, y, z, w)
 TimesLike: TypeAlias = Union[ArrayLike, timedelta]  # noqa: UP007 (at run time)
 """Times [s], as numbers or as durations of NumPy, pandas or `datetime`."""
 
+QUATERNION = slice(4)
+STAR_RATE = slice(4, 7)
+STAR = slice(7)
+LAGGED_TORQUES = slice(7, 10)
+"""Places in the state that is integrated.
+
+It has the quaternion of the star, its angular velocity in {E} [rad/s] (`STAR` is both),
+the torques of actuators that lag [N m], if any, and the work [J], if it is asked for.
+"""
+
+TORQUES = slice(3)
+MOMENT = slice(3, None)
+"""Places in what drives the equations: torques of the actuators, then the moment on the
+star in {B} [N m] where the scene takes one.
+"""
+
+JOINT_COUNT = 9
+"""Three joints of each of three legs. Their rates follow their angles."""
+
 SI_UNITS = frozenset(
     (
         "",

@@ -12,9 +12,18 @@ import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.integration.point import Drive
+from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile
-from sst_ros.state import NANOSECONDS, State, Vector3, clamp
+from sst_ros.state import (
+    LAGGED_TORQUES,
+    NANOSECONDS,
+    STAR,
+    ZERO,
+    State,
+    Vector3,
+    clamp,
+)
 
 _SEARCHED = 8
 """Parts of a step in which a jump is looked for."""
@@ -91,7 +100,7 @@ class AppliedTorque:
         if not isinstance(torque, TorqueProfile):
             return clamp(torque, self.limit)
         if torque.feedback:
-            return self.of_state(torque, time, y, self._dynamics.joints(*y[:7]))
+            return self.of_state(torque, time, y, self._dynamics.joints(*y[STAR]))
         return clamp(torque.at(time), self.limit)
 
     def of_state(
@@ -110,7 +119,7 @@ class AppliedTorque:
         """
         if not math.isfinite(sum(y)):
             return _NOT_FINITE
-        lagged = (y[7], y[8], y[9]) if self._lags else (0.0, 0.0, 0.0)
+        lagged = triple(y[LAGGED_TORQUES]) if self._lags else ZERO
         state = State.of(round(time * NANOSECONDS), y, joints, lagged)
         return clamp(torque.at(time, state), self.limit)
 

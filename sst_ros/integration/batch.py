@@ -33,6 +33,7 @@ from sst_ros.integration.batch_step import (
     Advance,
     Block,
     ColumnStep,
+    Endings,
     advance_blocks,
     locate_ends,
 )
@@ -43,7 +44,16 @@ from sst_ros.programs.llvm import LANES
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import FULL_TURN
-from sst_ros.state import Explained, cached_property, freeze
+from sst_ros.state import (
+    LAGGED_TORQUES,
+    QUATERNION,
+    STAR,
+    STAR_RATE,
+    TORQUES,
+    Explained,
+    cached_property,
+    freeze,
+)
 
 _UNUSED = {
     "initial": "is given to run, not as a parameter",
@@ -148,17 +158,12 @@ class Batch(Explained):
             self._scenarios.rows,
         )
 
-    def result_of(
-        self, code: NDArray[np.int64], fault_time: Array, error: Array, t: Array,
-        torque: Array, y: Array,
-    ) -> BatchResult:  # fmt: skip
+    def result_of(self, endings: Endings, t: Array, y: Array) -> BatchResult:
         """Return the states of all scenarios as a `BatchResult`.
 
         See there for the arguments.
         """
-        return BatchResult(
-            self.model, self.columns, torque, code, fault_time, error, t, y
-        )
+        return BatchResult(self.model, self.columns, endings, t, y)
 
     def with_parameters(self, scenarios: Scenarios) -> Batch:
         """Return a batch of other scenarios that shares this one's programs.
@@ -247,11 +252,11 @@ class Batch(Explained):
         steps[code < 0] = 0
         locate_ends(loop, step, steps, y, drives, code, time)
         last = steps * step
-        facts = self.model, self.columns, drives[:3].T, code, time, error
-        result = BatchResult(*facts, last, y)
+        endings = Endings(drives[TORQUES].T, code, time, error)
+        result = self.result_of(endings, last, y)
         if keep_every:
             samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
-            result.kept = BatchResult(*facts, samples, np.stack(kept))
+            result.kept = self.result_of(endings, samples, np.stack(kept))
         return result
 
     def _facts(self) -> dict[str, object]:
@@ -286,7 +291,7 @@ class Batch(Explained):
 
         """
         requirement = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
-        torque = self.model.ode.drive[:3] == TORQUE_SYMBOLS
+        torque = self.model.ode.drive[TORQUES] == TORQUE_SYMBOLS
         refuse_unless(
             "batch",
             ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
@@ -333,7 +338,7 @@ class Batch(Explained):
             )
             code[outside.any(axis=1)] = OUTSIDE_STATUS
         y = np.zeros((len(self.model.ode.state), len(angles)))
-        y[:7] = start
+        y[STAR] = start
         if alike and count:
             y = np.repeat(y, count, axis=1)
             code = np.repeat(code, count)
@@ -344,9 +349,11 @@ class Batch(Explained):
         drive = self.model.ode.drive
         columns = self.columns.inputs
         drive_rows = np.zeros((max(len(drive) + len(columns), 1), number))
-        if drive[:3] == TORQUE_SYMBOLS:
+        if drive[TORQUES] == TORQUE_SYMBOLS:
             limit = self.columns.torque_limit
-            drive_rows[:3] = np.clip(_rows("torque", torque, number).T, -limit, limit)
+            drive_rows[TORQUES] = np.clip(
+                _rows("torque", torque, number).T, -limit, limit
+            )
         drive_rows[len(drive) : len(drive) + len(columns)] = columns
         return drive_rows
 
@@ -448,28 +455,26 @@ class BatchResult(MotionTable):
         self,
         model: ParametricModel,
         columns: ParameterColumns,
-        torque: Array,  # commanded, shape (N, 3); not used under a profile
-        code: NDArray[np.int64],
-        fault_time: Array,
-        local_error: Array,
+        endings: Endings,
         t: Array,  # shape (N,) or (samples, N)
         y: Array,  # state of the integration, shape (state, N) or (samples, state, N)
     ) -> None:
         self._model = model
         self._columns = columns
-        self._torque = torque
+        self._torque = endings.torque
         self.scene = model.scene
         self._axes = ("time", "scenario") if t.ndim == 2 else ("scenario",)
+        code = endings.code
         self.code = code
-        self.fault_time = fault_time
-        self.local_error = local_error
+        self.fault_time = endings.fault_time
+        self.local_error = endings.local_error
         self.status = np.where(
             (code < 0) | (code == NOT_FINITE_CODE), -1, np.sign(code)
         )
         self.t = t
         self._state = np.moveaxis(y, -2, -1)
-        self.quaternion: Array = self._state[..., :4]
-        self.body_rate: Array = self._state[..., 4:7]
+        self.quaternion: Array = self._state[..., QUATERNION]
+        self.body_rate: Array = self._state[..., STAR_RATE]
         self.kept: BatchResult | None = None
         # torques of a controller, where they are not `torque`
         self.sent: Array | None = None
@@ -485,7 +490,7 @@ class BatchResult(MotionTable):
         if name not in self._computed:
             function = self._model.outputs[name]
             inputs = self._columns.inputs
-            states = np.moveaxis(self._state, -1, 0)[:7]
+            states = np.moveaxis(self._state, -1, 0)[STAR]
             count = self.t.shape[-1]
             components = np.empty((1 if name == "energy" else 3, *self.t.shape))
             size = max(1, _BATCH_BLOCK * count // max(self.t.size, 1))
@@ -503,7 +508,7 @@ class BatchResult(MotionTable):
     def torque(self) -> Array:
         """Torques that act at the actuators [N m], shape (..., N, 3)."""
         if self._state.shape[-1] > 7:
-            return self._state[..., 7:10]
+            return self._state[..., LAGGED_TORQUES]
         if self.sent is not None:
             return self.sent
         profile = self._model.constants(list(self._columns.inputs)).torque

@@ -20,6 +20,7 @@ from sst_ros.errors import check_kinds, check_kinds_late, refuse_unless
 from sst_ros.integration.batch_step import (
     EARLIEST,
     Block,
+    Endings,
     locate_ends,
     spaced_rows,
 )
@@ -27,7 +28,11 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
 from sst_ros.programs.llvm import LANES
+from sst_ros.state import QUATERNION, STAR, STAR_RATE, TORQUES
 
+_GAMMA = slice(3)
+_GAMMA_DOT = slice(3, 6)
+"""Rows of the joints that a session computes."""
 _WORTH_A_THREAD = 512
 """Robots: their step takes ten times as long as to wake a thread."""
 
@@ -82,12 +87,12 @@ class BatchSession:
         column_ranges = [
             slice(begin, begin + width) for begin in range(0, number, width)
         ]
-        joints = spaced_rows(6, width * len(column_ranges))
+        joints = spaced_rows(_GAMMA_DOT.stop, width * len(column_ranges))
         self.state = BatchState(
-            joints[:3, :number].T,
-            joints[3:, :number].T,
-            self._y[:4].T,
-            self._y[4:7].T,
+            joints[_GAMMA, :number].T,
+            joints[_GAMMA_DOT, :number].T,
+            self._y[QUATERNION].T,
+            self._y[STAR_RATE].T,
             code,
         )
         self._columns = self._y, self._drives, code, self.fault_time, self._error
@@ -128,13 +133,15 @@ class BatchSession:
 
     def _take_torques(self, torque: Any) -> None:
         """Write torques into the columns, clamped to the limit of the actuators."""
-        rows = self._drives[:3]
+        rows = self._drives[TORQUES]
         plain = type(torque) is np.ndarray and torque.dtype == float
         if plain and torque.shape == rows.T.shape and np.isfinite(torque).all():
             np.minimum(torque.T, self._torque_limit, out=rows)
             np.maximum(rows, -self._torque_limit, out=rows)
         else:
-            rows[:] = self._batch.drives(torque, rows.shape[1])[:3]  # or refuses them
+            rows[:] = self._batch.drives(torque, rows.shape[1])[
+                TORQUES
+            ]  # or refuses them
 
     @check_kinds
     def reset(
@@ -202,11 +209,10 @@ class BatchSession:
         batch = self._batch
         code = self.state.code.copy()
         fault = self.fault_time.copy()
-        torque = self._drives[:3].T.copy()
+        torque = self._drives[TORQUES].T.copy()
         last = np.where(np.isnan(fault), time, fault)
-        return batch.result_of(
-            code, fault, self._error.copy(), last, torque, self._y.copy()
-        )
+        endings = Endings(torque, code, fault, self._error.copy())
+        return batch.result_of(endings, last, self._y.copy())
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""
@@ -253,7 +259,7 @@ class _Robots:
         self._program = joints_of(batch)
         self._measure = [
             self._program.bind(
-                [*self._block.states(buffer)[:7], *self._varied], [*joints]
+                [*self._block.states(buffer)[STAR], *self._varied], [*joints]
             )
             for buffer in (0, 1)
         ]
@@ -276,14 +282,14 @@ class _Robots:
         y = np.ascontiguousarray(start[:, own_rows])
         self._block.replace(places, y, code[own_rows])
         varied = np.ascontiguousarray(self._varied[:, places])
-        joints = np.empty((6, len(own_rows)))
-        self._program((), [*y[:7], *varied], [*joints])
+        joints = np.empty((_GAMMA_DOT.stop, len(own_rows)))
+        self._program((), [*y[STAR], *varied], [*joints])
         self._joints[:, places] = joints
 
     def advance(self, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
         """Advance by some steps under the torques in the columns."""
-        torques = columns[1][:3, self._column_range]
-        self._block.given[:3, : torques.shape[1]] = torques
+        torques = columns[1][TORQUES, self._column_range]
+        self._block.given[TORQUES, : torques.shape[1]] = torques
         self._block.run(self._column_range, first, count, h, *columns)
         self._block.store(self._column_range, *columns)
         self._measure[self._block.now]()
@@ -297,5 +303,5 @@ def joints_of(batch: Any) -> Any:
         joints = model.joints(*inputs)
         return (*joints.gamma, *joints.gamma_dot)
 
-    inputs = (*model.ode.state[:7], *model.names)
+    inputs = (*model.ode.state[STAR], *model.names)
     return compile_columns({"angles": trace(angles, inputs)}, 0)["angles"]

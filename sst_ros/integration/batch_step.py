@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,7 @@ from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
 from sst_ros.programs.llvm import LANES
+from sst_ros.state import QUATERNION, STAR
 
 LANE_BLOCK = 192
 """Columns of a block at most: their numbers fit the cache of a core, and a step of all
@@ -67,6 +68,15 @@ _NO_SHARE = 2.0
 
 _EVENT_HALVINGS = 52
 """Of a step, until the share is known to all digits of a double."""
+
+
+class Endings(NamedTuple):
+    """How N scenarios ended; `BatchResult` says what the numbers mean."""
+
+    torque: Array  # commanded last [N m], shape (N, 3); not used under a profile
+    code: NDArray[np.int64]  # shape (N,), as are the others
+    fault_time: Array  # [s]
+    local_error: Array
 
 
 class ColumnStep:
@@ -96,7 +106,7 @@ class ColumnStep:
         self.traced = {
             "advance": trace(self._advance, inputs),
             "distances": trace(
-                self._distances, (*shared, *state[:7], *drive_names[self.varied])
+                self._distances, (*shared, *state[STAR], *drive_names[self.varied])
             ),
             "crossing": trace(share_of_crossing, ends),
         }
@@ -126,9 +136,9 @@ class ColumnStep:
         drives = [drive_numbers] * len(self._method.b)
         moved, errors = explicit_step(derivative, self._method, t, h, old, drives)
         new = normalise(moved)
-        far = self._model.distances(*new[:7], *drive_numbers[self.varied])
+        far = self._model.distances(*new[STAR], *drive_numbers[self.varied])
         worst = error
-        for state_error in (errors or ())[:4]:
+        for state_error in (errors or ())[QUATERNION]:
             worst = larger(worst, absolute(state_error))
         flag = larger(may_cross(h, was, far), is_not_finite(reduce(add, new)))
         # A scenario that has ended stays where it is.
@@ -181,7 +191,7 @@ class Block:
             step.advance.bind([*second, *fixed], [*first, self._flag]),
         )
         self._measure = step.distances.bind(
-            [*first[:7], *self.given[step.varied]],
+            [*first[STAR], *self.given[step.varied]],
             [*first[step.size : -1]],
         )
 
@@ -229,7 +239,7 @@ class Block:
         varied = np.ascontiguousarray(self.given[self._step.varied][:, places])
         distances = np.empty((2 * self._limits, len(places)))
         if self._limits:
-            self._step.distances((0.0, 0.0), [*y[:7], *varied], [*distances])
+            self._step.distances((0.0, 0.0), [*y[STAR], *varied], [*distances])
         current_rows[self._size : -1, places] = distances
 
     def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:

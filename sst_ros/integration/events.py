@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit, Transition
+from sst_ros.state import JOINT_COUNT
 
 Signal = Callable[[float], float]
 Joints = Callable[[float], Sequence[float]]
@@ -42,7 +43,7 @@ def all_far(
     for joint, least, most in ranges:
         if not (least < begin[joint] < most and least <= end[joint] <= most):
             return False
-        before, after = begin[joint + 9], end[joint + 9]
+        before, after = begin[joint + JOINT_COUNT], end[joint + JOINT_COUNT]
         if before * after < 0.0:
             reach = _REACH * h * max(abs(before), abs(after))
             lower, upper = min(begin[joint], end[joint]), max(begin[joint], end[joint])

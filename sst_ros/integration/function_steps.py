@@ -52,7 +52,7 @@ from sst_ros.programs.compiled import (
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
-from sst_ros.state import cached_property
+from sst_ros.state import MOMENT, STAR, cached_property
 
 Polynomial = Callable[[Array], Array]
 """Times after the begin of a step [s], shape (n,) -> states, shape (n, size)."""
@@ -132,7 +132,7 @@ class FunctionSteps:
             return self._step(t, h, y, linearised_at, drives[number])
 
         pair = step_pair(step, t, h, point.y, point.z, lagged_torques(self._ode))
-        joints = self._ode.dynamics.joints(*pair.y[:7])
+        joints = self._ode.dynamics.joints(*pair.y[STAR])
         total = pair.total + add_up(joints)
         numbers = [*pair.y, *pair.z, *joints, pair.size, total]
         return read_outcome(numbers, point, self._size)
@@ -146,7 +146,7 @@ class FunctionSteps:
     def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
         """See `MethodSteps.slope`."""
         torque = self._torque.of_drive(drive, t, y)
-        return [*self._slope(t, *y, *torque, *drive.numbers[3:])]
+        return [*self._slope(t, *y, *torque, *drive.numbers[MOMENT])]
 
     def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
         """See `MethodSteps.jacobian`."""
@@ -191,7 +191,7 @@ class FunctionSteps:
         """Linearise: exact by the state, by differences of the torque."""
         size = self._size
         torque = self._torque.of_drive(drive, t, y)
-        moment = drive.numbers[3:]
+        moment = drive.numbers[MOMENT]
         numbers = self._ode.linearised_by_torque(t, *y, *torque, *moment)
         rows = np.array(numbers).reshape(size + 5, size)
         slope = rows[0]
@@ -252,7 +252,7 @@ class TimeSteps(FunctionSteps):
     def jacobian(self, t: float, y: Sequence[float], drive: Drive) -> Array:
         """See `MethodSteps.jacobian`."""
         torque = self._torque.of_drive(drive, t, y)
-        return self._ode.matrix(t, y, (*torque, *drive.numbers[3:]))
+        return self._ode.matrix(t, y, (*torque, *drive.numbers[MOMENT]))
 
     def states_inside(
         self, steps: Sequence[Step], counts: Sequence[int], x: Array
@@ -262,7 +262,7 @@ class TimeSteps(FunctionSteps):
         begins = np.array(rows).repeat(counts, axis=0)
         begins[:, 1] = x
         torques = self._torques_inside(steps, counts, x)
-        moments = np.array([step.drive.numbers[3:] for step in steps])
+        moments = np.array([step.drive.numbers[MOMENT] for step in steps])
         moments = moments.repeat(counts, axis=0)[:, None, :]
         stages = (len(x), len(self.method.c))
         moments = np.broadcast_to(moments, (*stages, moments.shape[2]))
@@ -289,7 +289,7 @@ class TimeSteps(FunctionSteps):
     @staticmethod
     def _join(torques: Sequence[Any], drive: Drive) -> list[float]:
         """Return what acts in each stage, one stage after the other."""
-        moment = drive.numbers[3:]
+        moment = drive.numbers[MOMENT]
         numbers: list[float] = []
         for torque in torques:
             numbers += torque
@@ -396,6 +396,13 @@ class FeedbackSteps(FunctionSteps):
     def _functions(self) -> dict[str, Function]:
         return compile_stages(self._ode, self.method)
 
+    @cached_property
+    def _stages(self) -> list[tuple[float, Function]]:
+        """Node and compiled part of each stage."""
+        functions = self._functions
+        nodes = self.method.c
+        return [(node, functions[f"stage{k}"]) for k, node in enumerate(nodes)]
+
     def load(self) -> None:
         """Have the code compiled that a run calls."""
         _ = self._functions
@@ -418,9 +425,9 @@ class FeedbackSteps(FunctionSteps):
         half = 0.5 * h
         z = point.z
         slopes, y_end = self._go(t, h, point.y, point.joints, drive)
-        _, middle = self._go(t, half, z, joints(*z[:7]), second_drive)
+        _, middle = self._go(t, half, z, joints(*z[STAR]), second_drive)
         middle = middle[: self._size]
-        _, z_end = self._go(t + half, half, middle, joints(*middle[:7]), second_drive)
+        _, z_end = self._go(t + half, half, middle, joints(*middle[STAR]), second_drive)
         numbers = self._functions["end"](h, *point.y, *z, *y_end, *z_end)
         return read_outcome(numbers, point, self._size, slopes)
 
@@ -432,7 +439,7 @@ class FeedbackSteps(FunctionSteps):
         linearised_at: Sequence[float],
         drive: Drive,
     ) -> NewState:
-        joints = self._functions["joints"](*y[:7])
+        joints = self._functions["joints"](*y[STAR])
         _, numbers = self._go(t, h, y, joints, drive)
         return NewState(numbers[: self._size], None)
 
@@ -448,9 +455,8 @@ class FeedbackSteps(FunctionSteps):
 
         `joints` are those of y.
         """
-        functions = self._functions
         size = self._size
-        moment = drive.numbers[3:]
+        moment = drive.numbers[MOMENT]
         evaluate = self._torque.of_state
         function = drive.function
         start = drive.start
@@ -458,12 +464,10 @@ class FeedbackSteps(FunctionSteps):
         slopes: list[float] = []
         point = y
         numbers: list[float] = []
-        for number, node in enumerate(self.method.c):
+        for node, take_stage in self._stages:
             time = t + node * h if node else t
             torque = evaluate(function, start + time, point, joints)
-            numbers = functions[f"stage{number}"](
-                time, h, *y, *slopes, *point, *torque, *moment
-            )
+            numbers = take_stage(time, h, *y, *slopes, *point, *torque, *moment)
             slopes += numbers[:size]
             point = numbers[size : 2 * size]
             joints = numbers[2 * size :]
@@ -555,7 +559,7 @@ def trace_stages(
             new = end_step(method, h, y, slopes)
             return (*slopes[-1], *new.state, *(new.error or ()))
         following = move(y, h, method.a[number + 1], slopes)
-        return (*slopes[-1], *following, *joints(*following[:7]))
+        return (*slopes[-1], *following, *joints(*following[STAR]))
 
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
         y = inputs[:size]
@@ -567,7 +571,7 @@ def trace_stages(
             for end in (step_ends[:half], step_ends[half:])
         )
         pair = compare(h, y, z, first, second, lagged)
-        angles = joints(*pair.y[:7])
+        angles = joints(*pair.y[STAR])
         total = pair.total + add_up(angles)
         return (*pair.y, *pair.z, *angles, pair.size, total)
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import LAG, ODE
+from sst_ros.dynamics.traced_dynamics import LAG, ODE, STATE_SIZE
 from sst_ros.integration.methods import Method, Rosenbrock
 from sst_ros.integration.point import Drive, Outcome, Point, Step
 from sst_ros.integration.steps import (
@@ -36,7 +36,7 @@ from sst_ros.programs.compiled import (
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
-from sst_ros.state import cached_property
+from sst_ros.state import STAR, cached_property
 
 JACOBIAN_COST = 30
 """Measured cost of a Jacobian with factorisation, in evaluations of plain Python."""
@@ -198,80 +198,117 @@ def trace_steps(
         by_stage: whether an explicit step takes a drive for each stage.
 
     """
-    implicit = isinstance(method, Rosenbrock)
-    slope = Routine("slope", 1 + size + drive, size)
-    joints = Routine("joints", 7, JOINT_NUMBERS)
-    stages = len(method.a) if by_stage else 1
+    tracer = _StepTracer(method, size, drive, lagged, by_stage)
     state = [f"y{i}" for i in range(size)]
-    point_names = [f"near{i}" for i in range(size)] if implicit else []
-    second = [f"z{i}" for i in range(size)]
-    drives = [f"d{i}" for i in range(stages * drive)]
-    second_names = [f"e{i}" for i in range((2 if by_stage else 1) * stages * drive)]
-    step = Routine(
-        "step",
-        2 + size + len(point_names) + len(drives),
-        size * (2 if has_error(method) else 1),
-    )
+    second_state = [f"z{i}" for i in range(size)]
+    point = [f"near{i}" for i in range(tracer.point_size)]
+    drives = [f"d{i}" for i in range(tracer.drive_size)]
+    # Under a function of the time both steps of the second solution have their own.
+    second_count = tracer.drive_size * (2 if by_stage else 1)
+    second_drives = [f"e{i}" for i in range(second_count)]
+    pair_inputs = ("t", "h", *state, *second_state, *drives, *second_drives)
+    return {
+        "step": trace(tracer.take_step, ("t", "h", *state, *point, *drives)),
+        "pair": trace(tracer.take_pair, pair_inputs),
+        "single": trace(tracer.take_single, ("t", "h", *state, *drives)),
+    }
 
-    def derivative(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Sequence[Any]:
-        return slope(t, *y, *numbers)
 
-    def take_step(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+class _StepTracer:
+    """The programs of `trace_steps` as functions of numbers, with its arguments.
+
+    Attributes:
+        point_size: numbers of the state at which a step linearises; none if explicit.
+        drive_size: numbers of the drives of a step.
+
+    """
+
+    def __init__(
+        self, method: Method, size: int, drive: int, lagged: int, by_stage: bool
+    ) -> None:
+        self._method = method
+        self._size = size
+        self._drive = drive
+        self._lagged = lagged
+        self._stages = len(method.a) if by_stage else 1
+        self.point_size = size if isinstance(method, Rosenbrock) else 0
+        self.drive_size = self._stages * drive
+        self._slope = Routine("slope", 1 + size + drive, size)
+        self._joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
+        step_inputs = 2 + size + self.point_size + self.drive_size
+        self._step = Routine(
+            "step", step_inputs, size * (2 if has_error(method) else 1)
+        )
+
+    def take_step(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        """Return the new state, and its error where the method estimates it."""
+        size = self._size
+        method = self._method
         y = inputs[:size]
-        point = inputs[size : size + len(point_names)]
-        numbers = inputs[size + len(point_names) :]
+        point = inputs[size : size + self.point_size]
+        numbers = inputs[size + self.point_size :]
         if isinstance(method, Rosenbrock):
-            linearisation = _linearise(t, point, numbers)
-            new = rosenbrock_step(derivative, linearisation, method, t, h, y, numbers)
+            linearisation = self._linearise(t, point, numbers)
+            new = rosenbrock_step(
+                self._derivative, linearisation, method, t, h, y, numbers
+            )
         else:
-            stage_drives = [numbers[drive * k : drive * (k + 1)] for k in range(stages)]
-            each = stage_drives if by_stage else stage_drives * len(method.a)
-            new = explicit_step(derivative, method, t, h, y, each)
+            drives = [
+                numbers[self._drive * k : self._drive * (k + 1)]
+                for k in range(self._stages)
+            ]
+            if self._stages == 1:
+                drives = drives * len(method.a)
+            new = explicit_step(self._derivative, method, t, h, y, drives)
         return (*new.state, *(new.error or ()))
 
-    def _linearise(t: Any, y: Sequence[Any], numbers: Sequence[Any]) -> Linearisation:
-        results = Routine("linearise", 1 + size + drive, (size + 2) * size)(
-            t, *y, *numbers
-        )
-        rows = [results[size * k : size * (k + 1)] for k in range(size + 2)]
-        return Linearisation(rows[0], rows[1], rows[2:])
-
-    def take_pair(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+    def take_pair(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        """Return what both solutions have become, and the size of the error."""
+        size = self._size
         y = inputs[:size]
         z = inputs[size : 2 * size]
         drive_inputs = inputs[2 * size :]
-        second_drives = drive_inputs[len(drives) :]
+        second_drives = drive_inputs[self.drive_size :]
         # of the step of y, and of both steps of z, which may have the same
         drives_of_steps = (
-            drive_inputs[: len(drives)],
-            second_drives[: len(drives)],
-            second_drives[-len(drives) :],
+            drive_inputs[: self.drive_size],
+            second_drives[: self.drive_size],
+            second_drives[-self.drive_size :],
         )
 
         def call(
             number: int, t: Any, h: Any, y: Sequence[Any], linearised_at: Sequence[Any]
         ) -> NewState:
-            results = step(
-                t, h, *y, *(linearised_at if implicit else ()), *drives_of_steps[number]
-            )
+            point = linearised_at[: self.point_size]
+            results = self._step(t, h, *y, *point, *drives_of_steps[number])
             return NewState([*results[:size]], [*results[size:]] or None)
 
-        pair = step_pair(call, t, h, y, z, lagged)
-        angles = joints(*pair.y[:7])
+        pair = step_pair(call, t, h, y, z, self._lagged)
+        angles = self._joints(*pair.y[STAR])
         total = pair.total + add_up(angles)
         return (*pair.y, *pair.z, *angles, pair.size, total)
 
-    def take_single(t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+    def take_single(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+        """Return the new state."""
+        size = self._size
         y = inputs[:size]
-        numbers = inputs[size:]
-        results = step(t, h, *y, *(y if implicit else ()), *numbers)
+        results = self._step(t, h, *y, *y[: self.point_size], *inputs[size:])
         return tuple(normalise(results[:size]))
 
-    return {
-        "step": trace(take_step, ("t", "h", *state, *point_names, *drives)),
-        "pair": trace(take_pair, ("t", "h", *state, *second, *drives, *second_names)),
-        "single": trace(take_single, ("t", "h", *state, *drives)),
-    }
+    def _derivative(
+        self, t: Any, y: Sequence[Any], numbers: Sequence[Any]
+    ) -> Sequence[Any]:
+        return self._slope(t, *y, *numbers)
+
+    def _linearise(
+        self, t: Any, y: Sequence[Any], numbers: Sequence[Any]
+    ) -> Linearisation:
+        size = self._size
+        inputs = 1 + size + self._drive
+        results = Routine("linearise", inputs, (size + 2) * size)(t, *y, *numbers)
+        rows = [results[size * k : size * (k + 1)] for k in range(size + 2)]
+        slope, by_time, *columns = rows
+        return Linearisation(slope, by_time, columns)
 
 
 def has_error(method: Method) -> bool:

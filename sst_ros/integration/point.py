@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Method
-from sst_ros.scene.torque_profile import SineTorque, TorqueProfile
+from sst_ros.scene.torque_profile import SineTorque, Torque, TorqueProfile
+from sst_ros.state import QUATERNION, STAR_RATE, Vector3
 
 _ERROR_MARGIN = 2.0
 """Factor on the distance of both solutions.
@@ -56,8 +57,8 @@ class Point(NamedTuple):
     @property
     def rate_error(self) -> float:
         """Estimated global error of the body rate [rad/s]."""
-        speed = max(1.0, math.hypot(*self.y[4:7]))
-        distance = math.dist(self.y[4:7], self.z[4:7]) / speed
+        speed = max(1.0, math.hypot(*self.y[STAR_RATE]))
+        distance = math.dist(self.y[STAR_RATE], self.z[STAR_RATE]) / speed
         return speed * estimate_error(distance, self.steps)
 
 
@@ -71,7 +72,9 @@ def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
 
     q and -q are the same.
     """
-    return 2.0 * min(math.dist(y[:4], z[:4]), math.dist(y[:4], [-x for x in z[:4]]))
+    q = y[QUATERNION]
+    p = z[QUATERNION]
+    return 2.0 * min(math.dist(q, p), math.dist(q, [-x for x in p]))
 
 
 def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
@@ -80,9 +83,22 @@ def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
     That of the rest is relative to the rate. Rates below 1 rad/s count as 1 rad/s;
     infinite where a number is not finite.
     """
-    speed = max(1.0, math.hypot(*z[4:7]))
-    distance = max(orientation_distance(y, z), math.dist(y[4:], z[4:]) / speed)
+    speed = max(1.0, math.hypot(*z[STAR_RATE]))
+    distance_of_others = math.dist(y[STAR_RATE.start :], z[STAR_RATE.start :])
+    distance = max(orientation_distance(y, z), distance_of_others / speed)
     return distance if math.isfinite(distance) else math.inf
+
+
+class Period(NamedTuple):
+    """A stretch of time: a tick, a control period, or a whole smooth motion."""
+
+    start: float  # when it begins [s]
+    h: float  # its length [s]
+    torque: Torque  # one of `AppliedTorque.acting`
+    moment: tuple[float, ...] = ()
+    """External moment on the star in {B} [N m], empty where no topic gives one."""
+    second_torque: Vector3 | None = None
+    """Constant torques of the second solution [N m], None where they are the same."""
 
 
 class Drive(NamedTuple):
@@ -95,6 +111,13 @@ class Drive(NamedTuple):
     function: TorqueProfile | None = None  # torques that the steps evaluate
     start: float = 0.0  # time of the run at which that of the steps is zero [s]
     sine: SineTorque | None = None  # torques that are part of the traced equations
+
+
+class Drives(NamedTuple):
+    """What acts on both solutions."""
+
+    first: Drive
+    second: Drive | None  # None where it is the same
 
 
 class Outcome(NamedTuple):

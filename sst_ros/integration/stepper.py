@@ -34,7 +34,7 @@ from sst_ros.dynamics.model import (
     ranges_of,
     transitions_of,
 )
-from sst_ros.dynamics.traced_dynamics import Dynamics, recent_ode
+from sst_ros.dynamics.traced_dynamics import STATE_SIZE, Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.events import (
     all_far,
@@ -63,14 +63,20 @@ from sst_ros.integration.methods import (
     Method,
     Rosenbrock,
 )
-from sst_ros.integration.point import Drive, MethodChange, Point, Step
+from sst_ros.integration.point import (
+    Drive,
+    Drives,
+    MethodChange,
+    Period,
+    Point,
+    Step,
+)
+from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import ConstantTorque, SineTorque, Torque
-from sst_ros.state import Vector3
+from sst_ros.state import LAGGED_TORQUES, MOMENT, STAR, ZERO, Vector3
 
-Moment = tuple[float, ...]
-"""External moment on the star in {B} [N m] from a topic of the scene, else empty."""
 Steps = MethodSteps | FunctionSteps
 
 WHOLE_MOTION_BUDGET = 10_000_000
@@ -241,14 +247,15 @@ class Stepper:
         first of those that it may use.
         """
         full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
-        joints = tuple(self.dynamics.joints(*full[:7]))
+        joints = tuple(self.dynamics.joints(*full[STAR]))
         return Point(full, list(full), joints, method or self._methods[0])
 
     def load(self) -> None:
         """Have the code compiled that periods under constant torques may need."""
         import scipy.optimize  # noqa: F401  # takes 0.4 s, too long for a step in real time
 
-        drive = self._hold((0.0, 0.0, 0.0), 0.0, (0.0,) * len(self.dynamics.drive[3:]))
+        no_moment = (0.0,) * len(self.dynamics.drive[MOMENT])
+        drive = self._drive_of(Period(0.0, 0.0, ZERO, no_moment))
         for method in self._methods if self._chooses else self._methods[:1]:
             self._steps_of(drive, method).load()
         if self._chooses:
@@ -256,31 +263,21 @@ class Stepper:
 
     def acting(self, torque: Torque, time: float, point: Point) -> Vector3:
         """Torques that the actuators give at a time [s] and a point [N m]."""
-        if len(self.dynamics.state) > 7:  # they lag
-            return point.y[7], point.y[8], point.y[9]
+        if len(self.dynamics.state) > STATE_SIZE:  # they lag
+            return triple(point.y[LAGGED_TORQUES])
         return self.torque.at(torque, time, point.y)
 
     def advance(
         self,
         point: Point,
-        start: float,
-        h: float,
-        torque: Torque,
-        moment: Moment = (),
-        *,
-        other: Vector3 | None = None,
+        period: Period,
         visit: Callable[[Step], None] | None = None,
     ) -> Point:
         """Advance through a period, by steps up to the first event in each.
 
         Args:
             point: where it begins.
-            start: when it begins [s].
-            h: its length [s].
-            torque: one of `AppliedTorque.acting`.
-            moment: from a topic.
-            other: constant torques of the second solution, by default those of the
-                first [N m].
+            period: its time, and what acts in it.
             visit: called with each step that is done.
 
         Raises:
@@ -289,14 +286,13 @@ class Stepper:
             BudgetSpent: the period takes more evaluations than it may.
 
         """
-        drive = self._hold(torque, start, moment)
-        second = None if other is None else Drive((*other, *moment))
+        drives = self._hold(period)
         self.budget.begin()
         x = 0.0
         stops = list[float]()
-        steps = self._steps_of(drive, point.method)
-        while x < h:
-            step = self._take_step(x, h, point, drive, second, stops, steps)
+        steps = self._steps_of(drives.first, point.method)
+        while x < period.h:
+            step = self._take_step(x, period.h, point, drives, stops, steps)
             steps = step.steps
             event = None
             if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
@@ -313,7 +309,7 @@ class Stepper:
                 x = step.t + step.h
                 stops.clear()
                 if event.error is not None:
-                    raise LimitReached(event, start + x)
+                    raise LimitReached(event, period.start + x)
             elif step.last:
                 break
             elif stops and step.h == stops[0] - x:
@@ -322,15 +318,26 @@ class Stepper:
                 x += step.h
         return point
 
-    def _hold(self, torque: Torque, start: float, moment: Moment) -> Drive:
-        """Return what acts in a period that begins at `start` [s]."""
+    def _hold(self, period: Period) -> Drives:
+        """Return what acts in a period on both solutions."""
+        second = period.second_torque
+        return Drives(
+            self._drive_of(period),
+            None if second is None else Drive((*second, *period.moment)),
+        )
+
+    def _drive_of(self, period: Period) -> Drive:
+        """Return what acts in a period on the first solution."""
+        torque = period.torque
+        moment = period.moment
+        start = period.start
         if isinstance(torque, tuple):
             if self._derivative is None:
                 return Drive((*torque, *moment), None, start)
             torque = ConstantTorque(torque)
         sine = self.traced_sine(torque)
         if sine is None:
-            return Drive((0.0, 0.0, 0.0, *moment), torque, start)
+            return Drive((*ZERO, *moment), torque, start)
         rows = zip(sine.frequency, sine.phase, strict=True)
         phases = (math.fmod(f * start + phase, math.tau) for f, phase in rows)
         return Drive((*phases, *moment), None, start, sine)
@@ -375,8 +382,7 @@ class Stepper:
         t: float,
         end: float,
         point: Point,
-        drive: Drive,
-        second_drive: Drive | None,
+        drives: Drives,
         stops: list[float],
         steps: Steps,
     ) -> Step:
@@ -385,18 +391,16 @@ class Stepper:
         `stops` are the times just before and after a jump that was found, where steps
         end; `steps` those that the last step was taken by.
         """
-        rejected = leaps = looks = 0
+        drive, second = drives
+        rejected = 0
+        leaps = 0
+        looks = 0
         while True:
             if steps.method is not point.method:
                 steps = self._steps_of(drive, point.method)
-            left = end - t
-            h = min(point.h, self._max_step, left)
-            if left - h < _LAST_SLIVER * h:
-                h = left
-            if stops:  # a step ends before a jump, the next one steps over it
-                h = min(h, stops[0] - t)
-            self.budget.charge((3 if second_drive is None else 6) * steps.cost)
-            after, size, stages = steps.pair(t, h, point, drive, second_drive)
+            h = self._length_of(point, t, end, stops)
+            self.budget.charge((3 if second is None else 6) * steps.cost)
+            after, size, stages = steps.pair(t, h, point, drive, second)
             error = size / self._tolerance
             if size <= self._tolerance:
                 if looks < _MOST_LOOKS and self._meets_pulse(t, h, point, drive, stops):
@@ -413,26 +417,11 @@ class Stepper:
                         point = point._replace(h=h * share)
                         leaps += 1
                         continue
-                stopped = bool(stops) and h == stops[0] - t
-                longest = _next_length(point, h, error, cut=stopped or h == left)
-                if passed > 0.0:  # the next step is not to be refused for a leap
-                    longest = min(longest, SAFETY * h / passed)
-                counts_attempt = self._chooses and (
-                    h < left or isinstance(point.method, Rosenbrock)
-                )
-                attempts = point.attempts + 1 if counts_attempt else point.attempts
-                end_point = Point(
-                    after.y, after.z, after.joints, point.method, longest, attempts,
-                    after.steps, point.changes,
-                )  # fmt: skip
-                if counts_attempt:
-                    end_point = self._choose_method(
-                        steps, t + h, h, end_point, drive, 0
-                    )
-                last = h == left
-                return Step(
-                    t, h, point, end_point, drive, second_drive, steps, last, stages
-                )
+                last = h == end - t
+                step = Step(t, h, point, after, drive, second, steps, last, stages)
+                ends_before_jump = bool(stops) and h == stops[0] - t
+                is_cut = last or ends_before_jump
+                return self._plan_next(step, error, passed, is_cut=is_cut)
             stops[:] = self._jump_in(t, h, point.y, drive)
             if stops:
                 point = point._replace(h=h)
@@ -444,6 +433,47 @@ class Stepper:
             if self._chooses:
                 point = point._replace(attempts=point.attempts + 1)
                 point = self._choose_method(steps, t, h, point, drive, rejected)
+
+    def _length_of(
+        self, point: Point, t: float, end: float, stops: Sequence[float]
+    ) -> float:
+        """Return the length of the next step from t [s], to `end` at most."""
+        left = end - t
+        h = min(point.h, self._max_step, left)
+        if left - h < _LAST_SLIVER * h:
+            h = left
+        if stops:  # a step ends before a jump, the next one steps over it
+            h = min(h, stops[0] - t)
+        return h
+
+    def _plan_next(
+        self, step: Step, error: float, passed: float, *, is_cut: bool
+    ) -> Step:
+        """Return an accepted step whose end has the length and method of the next one.
+
+        Args:
+            step: as it was taken.
+            error: its local error relative to the tolerance.
+            passed: largest share of a change of friction that it has passed over.
+            is_cut: whether it is shorter than the error allows.
+
+        """
+        h = step.h
+        begin = step.begin
+        end = step.end
+        longest = _next_length(begin, h, error, cut=is_cut)
+        if passed > 0.0:  # the next step is not to be refused for a leap
+            longest = min(longest, SAFETY * h / passed)
+        is_implicit = isinstance(begin.method, Rosenbrock)
+        counts_attempt = self._chooses and (is_implicit or not step.last)
+        attempts = begin.attempts + 1 if counts_attempt else begin.attempts
+        end = Point(
+            end.y, end.z, end.joints, begin.method, longest, attempts, end.steps,
+            begin.changes,
+        )  # fmt: skip
+        if counts_attempt:
+            end = self._choose_method(step.steps, step.t + h, h, end, step.drive, 0)
+        return step._replace(end=end)
 
     def _choose_method(
         self,
@@ -554,7 +584,7 @@ class Stepper:
                 return end
             self.budget.charge(step.steps.cost)
             state = step.inside(x)
-            inside = self.dynamics.joints(*state[:7])
+            inside = self.dynamics.joints(*state[STAR])
             if not math.isfinite(sum(state) + sum(inside)):
                 raise _NoState
             return inside

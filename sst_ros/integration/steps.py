@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Rosenbrock, Tableau
 from sst_ros.mechanism.generic_math import absolute, larger, select, sqrt
+from sst_ros.state import QUATERNION, STAR, STAR_RATE
 
 Number = Any
 Numbers = Sequence[Any]
@@ -230,9 +231,10 @@ def substitute(decomposition: Decomposition, right: Numbers) -> list[Number]:
 
 def normalise(y: Numbers) -> list[Number]:
     """Return a state whose quaternion has length 1."""
-    x, y_, z, w = y[:4]
+    x, y_, z, w = y[QUATERNION]
     factor = 1.0 / sqrt(x * x + y_ * y_ + z * z + w * w)
-    return [*(number * factor for number in y[:4]), *y[4:]]
+    quaternion = [number * factor for number in y[QUATERNION]]
+    return [*quaternion, *y[QUATERNION.stop :]]
 
 
 def size_of_error(
@@ -245,13 +247,13 @@ def size_of_error(
     to the largest of them. The work is not looked at.
     """
     largest: Number = 0.0
-    for number in error[:4]:
+    for number in error[QUATERNION]:
         largest = larger(largest, absolute(number))
-    rate, worst = _measure_error(error, old, new, slice(4, 7), least=0.0)
+    rate, worst = _measure_error(error, old, new, STAR_RATE, least=0.0)
     least_rate = _RADIANS_PER_STEP / absolute(h)
     largest = larger(largest, worst / larger(rate, least_rate))
     if lagged:
-        torques = slice(7, 7 + lagged)
+        torques = slice(STAR.stop, STAR.stop + lagged)
         torque, worst = _measure_error(
             error, old, new, torques, least=_NO_DIVISION_BY_ZERO
         )

@@ -26,7 +26,7 @@ import pandas as pd
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.integration.methods import DOP853
-from sst_ros.integration.point import Point
+from sst_ros.integration.point import Period, Point
 from sst_ros.integration.stepper import CannotStep, EvaluationBudget, Stepper
 from sst_ros.mechanism.geometry import Array, Geometry, angle_between
 from sst_ros.progress import Bar
@@ -99,7 +99,8 @@ class TickStepper(Stepper):
         begin = start_ns / NANOSECONDS
         length = (end_ns - start_ns) / NANOSECONDS / count
         for index in range(count):
-            point = self.advance(point, begin + length * index, length, acting, moment)
+            start = begin + length * index
+            point = self.advance(point, Period(start, length, acting, moment))
         return point
 
 

@@ -8,15 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sst_ros.dynamics.traced_dynamics import STATE_SIZE
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.point import Step
 from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import Torque
-from sst_ros.state import Array
-
-_STATE_NUMBERS = 7
-"""Numbers of a sample's state: quaternion and body rate."""
+from sst_ros.state import LAGGED_TORQUES, QUATERNION, STAR, STAR_RATE, Array
 
 
 class SampleTable(NamedTuple):
@@ -98,10 +96,10 @@ class Samples:
             rows, noted_states = zip(*self._states, strict=True)
             states[list(rows)] = noted_states
         self._step_to(t, states)
-        joints = self._stepper.dynamics.joints_of_rows(states[:, :_STATE_NUMBERS])
+        joints = self._stepper.dynamics.joints_of_rows(states[:, STAR])
         torque = self._torque_at(t, states, joints)
         return SampleTable(
-            t, states[:, :4], states[:, 4:_STATE_NUMBERS], torque, joints
+            t, states[:, QUATERNION], states[:, STAR_RATE], torque, joints
         )
 
     def _step_to(self, t: Array, states: Array) -> None:
@@ -121,8 +119,8 @@ class Samples:
     def _torque_at(self, t: Array, states: Array, joints: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
         # the actuators lag: they are part of the state
-        if states.shape[1] > _STATE_NUMBERS + 1:
-            return states[:, _STATE_NUMBERS : _STATE_NUMBERS + 3]
+        if states.shape[1] > STATE_SIZE + 1:
+            return states[:, LAGGED_TORQUES]
         torques = np.empty((len(t), 3))
         applied = self._stepper.torque
         ends = [first for first, _ in self._torques[1:]]

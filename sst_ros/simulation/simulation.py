@@ -22,7 +22,7 @@ from sst_ros.errors import (
     refuse_unless,
 )
 from sst_ros.integration.methods import AUTO, METHODS, RK4, Rosenbrock
-from sst_ros.integration.point import MethodChange, Point
+from sst_ros.integration.point import MethodChange, Period, Point
 from sst_ros.integration.stepper import (
     BudgetSpent,
     CannotStep,
@@ -44,6 +44,7 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.state import (
     NANOSECONDS,
+    STAR_RATE,
     ZERO,
     Explained,
     State,
@@ -310,7 +311,7 @@ class Simulation(Explained):
                 # Take steps of the integrator up to the end of the period.
                 try:
                     point = self._stepper.advance(
-                        instant.point, start, h, torque, acting_moment
+                        instant.point, Period(start, h, torque, acting_moment)
                     )
                 except (LimitReached, CannotStep) as stop:
                     raise self._explain(stop, start) from None
@@ -353,7 +354,8 @@ class Simulation(Explained):
         h = (time_ns - began) / NANOSECONDS
         torque = self._current.torque
         moment = self._current.moment
-        point = self._stepper.advance(self._before.point, start, h, torque, moment)
+        period = Period(start, h, torque, moment)
+        point = self._stepper.advance(self._before.point, period)
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
     def reset(self) -> State:
@@ -407,7 +409,7 @@ class Simulation(Explained):
         moment = (instant.moment or ZERO) if self.dynamics.has_moment_topic else ()
         state = instant.point.y[: len(self.dynamics.state)]
         slope = self.dynamics.derivative(*state, *self._torque(instant), *moment)
-        return triple(slope[4:7])
+        return triple(slope[STAR_RATE])
 
     @property
     def time_ns(self) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import AUTO, DOP853, Method
-from sst_ros.integration.point import Point, Step, state_distance
+from sst_ros.integration.point import Period, Point, Step, state_distance
 from sst_ros.integration.stepper import (
     ACCURATE,
     CannotStep,
@@ -30,7 +30,7 @@ from sst_ros.progress import Bar
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import Torque, TorqueProfile
 from sst_ros.simulation.samples import Samples
-from sst_ros.state import NANOSECONDS, Array, State, Vector3, clamp
+from sst_ros.state import MOMENT, NANOSECONDS, Array, State, Vector3, clamp
 
 _WARN_AFTER = 100_000
 """Evaluations, a second of work where a function gives the torques, after which a
@@ -109,7 +109,7 @@ class SteppedMotion:
         # on the second solution, where they differ
         self._second_torque: Vector3 | None = None
         self._segment = task.span
-        self._moment = (0.0,) * len(self.stepper.dynamics.drive[3:])
+        self._moment = (0.0,) * len(self.stepper.dynamics.drive[MOMENT])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
         self._spent_before = budget.spent
         self._warn_after: float = budget.spent + _WARN_AFTER
@@ -184,15 +184,8 @@ class SteppedMotion:
         self._segment = begin, end
         self._torque = self.stepper.torque.acting(torque)
         self._take_if_wanted(begin, self.point.y)
-        self.stepper.advance(
-            self.point,
-            begin,
-            h,
-            self._torque,
-            self._moment,
-            other=self._second_torque,
-            visit=self._pass,
-        )
+        period = Period(begin, h, self._torque, self._moment, self._second_torque)
+        self.stepper.advance(self.point, period, visit=self._pass)
 
     def _pass(self, step: Step) -> None:
         """Take the samples in a step, and note where the motion stands."""

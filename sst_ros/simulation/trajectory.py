@@ -53,8 +53,11 @@ from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.tables import SUFFIXES, load_table, write_table
 from sst_ros.state import (
     DIMENSIONS,
+    LAGGED_TORQUES,
     MOTION_UNITS,
     QUANTITIES,
+    QUATERNION,
+    STAR_RATE,
     Array,
     TimesLike,
     cached_property,
@@ -358,7 +361,8 @@ class Trajectory(MotionTable):
         y = self._columns
         with np.errstate(all="ignore"):
             slope = kernel.derivative(model, y, triple(self.torque.T))
-            accelerations = kernel.actuator_acceleration(model, y, triple(slope[4:7]))
+            acceleration = triple(slope[STAR_RATE])
+            accelerations = kernel.actuator_acceleration(model, y, acceleration)
         return freeze(
             np.stack([np.broadcast_to(x, self.t.shape) for x in accelerations], axis=1)
         )
@@ -471,9 +475,9 @@ class Trajectory(MotionTable):
         return Trajectory(
             self.scene,
             times,
-            states[:, :4],
-            states[:, 4:7],
-            states[:, 7:],
+            states[:, QUATERNION],
+            states[:, STAR_RATE],
+            states[:, LAGGED_TORQUES],
             run=self.run,
             gaps=self.gaps,
         )
