@@ -7,8 +7,8 @@ ROS ?= ros
 EXTRAS = $(ROS),record,plot,fast,proof
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
-# The tests of the nodes wait two thirds of their time.
-PARALLEL_NODES = --numprocesses $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder
+# The tests of the nodes wait two thirds of their time, and each worker imports ROS.
+PARALLEL_NODES = --numprocesses $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder
 # Python compiles what is imported; pip would compile all 15,000 files.
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
 # Where the environment forbids to keep it, each of some hundred processes compiles NumPy anew.
