@@ -263,12 +263,20 @@ BEGIN_S = 30.0
 """Within this time a recording has begun, see `OwnTime`."""
 
 
+GIVE_UP_S = 300.0
+"""The recorder ends by itself if it has not found all topics by then."""
+
+
 def recorder_kills(ledger: Ledger) -> None:
-    """Kill the recorder at random moments: all but the last chunk comes back."""
+    """Kill the recorder at random moments: all but the last chunk comes back.
+
+    Before it says that it is ready it has not discovered all topics: what it records
+    until then is not a run.
+    """
     for number in ledger.cases(34):
         with TemporaryDirectory() as name, own_domain():
             bag = Path(name) / "bag"
-            recorder = start("recorder", output=bag)
+            recorder = start("recorder", output=bag, timeout=GIVE_UP_S)
             simulator = start("simulator", scene="swing", duration=0.0)
             try:
                 own_time = OwnTime(recorder.pid, simulator.pid)
@@ -280,6 +288,9 @@ def recorder_kills(ledger: Ledger) -> None:
                     ledger.add_finding(
                         "hangs", f"kill {number}: {size} bytes in time, ends: {states}"
                     )
+                    continue
+                if not _says_ready(recorder):
+                    ledger.add_finding("hangs", f"kill {number}: never ready")
                     continue
                 # The wait is the experiment: the moment of the kill is random.
                 time.sleep(ledger.rng.uniform(1.5, 4.0))
@@ -297,6 +308,14 @@ def recorder_kills(ledger: Ledger) -> None:
             finally:
                 for process in (simulator, recorder):
                     process.end(signal.SIGKILL, 20.0)
+
+
+def _says_ready(recorder: Process) -> bool:
+    """Wait until a recorder says that it records all topics, or has ended."""
+    while line := recorder.line():
+        if line.startswith("ready"):
+            return True
+    return False
 
 
 def _size(bag: Path) -> int:
