@@ -11,6 +11,8 @@ PARALLEL = --numprocesses auto --dist loadfile
 PARALLEL_NODES = --numprocesses $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder
 # Python compiles what is imported; pip would compile all 15,000 files.
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
+# Where the environment forbids to keep it, each of some hundred processes compiles NumPy anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo demo-feedforward demo-identify demo-sweep docs paper view test test-all test-jazzy test-ros test-slow lint lint-style lint-types lint-words format clean
 

@@ -391,7 +391,7 @@ def main(arguments: list[str] | None = None) -> int:
     import jax
 
     options = read_options("equations", __doc__, arguments, no_page=False)
-    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]
+    jax.config.update("jax_enable_x64", True)
     values = [compare(name) for name in names()]
     times = [measure_times(name) for name in TIMED]
     sizes = [measure_sizes(name) for name in TIMED]

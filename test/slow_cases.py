@@ -11,3 +11,22 @@ def slow_except(quick, cases):
         case if case in quick else pytest.param(case, marks=pytest.mark.slow)
         for case in cases
     ]
+
+
+def slow_after(count, cases):
+    """Return parameters for a test: the first cases, and those after them as slow.
+
+    A tuple is a case of several parameters, as in `pytest.mark.parametrize`.
+    """
+    cases = list(cases)
+    return [*cases[:count], *(_slow(case) for case in cases[count:])]
+
+
+def _slow(case):
+    """Return the case of a slow test, with the marks and the id that it has already."""
+    values, marks, name = case, (), None
+    if isinstance(case, type(pytest.param())):
+        values, marks, name = case.values, case.marks, case.id
+    elif not isinstance(case, tuple):
+        values = (case,)
+    return pytest.param(*values, marks=[*marks, pytest.mark.slow], id=name)

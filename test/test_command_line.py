@@ -182,10 +182,15 @@ def error_of(words, capsys):
         (["scene", "show", "nowhere"], "must be a readable .yaml file or one of"),
         (["report", "accuracy", "nowhere"], "must be a readable .yaml file or one of"),
         (["plan", "check", "spiral", "--csv", "{here}"], "--csv"),
-        (["plan", "check", "spiral", "--force", "--csv", "{here}"], "Is a directory"),
-        (
+        pytest.param(
+            ["plan", "check", "spiral", "--force", "--csv", "{here}"],
+            "Is a directory",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
             ["plan", "check", "spiral", "--csv", "/proc/torques.csv"],
             "/proc/torques.csv",
+            marks=pytest.mark.slow,
         ),
         (["demo", "--out", "/etc/passwd"], "exists already"),
         (["demo", "--force", "--out", "/etc/passwd"], "Not a directory"),
@@ -293,7 +298,9 @@ NEEDED = {
 @pytest.mark.parametrize(
     ("line", "modules"),
     [
-        pytest.param(line, name, marks=pytest.mark.slow if number else ())
+        pytest.param(
+            line, name, marks=pytest.mark.slow if number or name != "rclpy" else ()
+        )
         for name, lines in NEEDED.items()
         for number, line in enumerate(lines)
     ],
@@ -391,6 +398,7 @@ def test_a_scene_is_simulated_from_the_command_line(tmp_path, monkeypatch, capsy
     assert said.err == ""
 
 
+@pytest.mark.slow
 def test_the_workspace_of_a_scene_is_drawn(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["workspace", "example2"]) == 0

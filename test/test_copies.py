@@ -8,6 +8,7 @@ import threading
 import bags as recorded
 import numpy as np
 import pytest
+from slow_cases import slow_after
 
 import sst_ros
 from sst_ros import (
@@ -176,7 +177,7 @@ def held_arrays(result):
 
 
 @pytest.mark.parametrize(
-    "make_copy", [lambda x: x, *COPIES.values()], ids=["itself", *COPIES]
+    "make_copy", slow_after(1, [lambda x: x, *COPIES.values()]), ids=["itself", *COPIES]
 )
 def test_no_array_of_a_result_can_be_written_to(tmp_path, make_copy):
     pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")

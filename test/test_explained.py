@@ -125,6 +125,7 @@ def test_geometries_of_a_map_say_how_many_they_are():
     assert re.search(r"geometries +4\n", repr(many))
 
 
+@pytest.mark.slow
 def test_no_heading_of_a_scene_is_empty(tmp_path, capsys):
     bare = dataclasses.replace(load_scene("example1"), provenance=())
     path = tmp_path / "bare.yaml"

@@ -108,6 +108,7 @@ def test_with_friction_the_kinetic_energy_is_less_than_without():
     assert np.ptp(of("friction", "gamma"), axis=0).min() > 0.05
 
 
+@pytest.mark.slow
 def test_elastic_stops_catch_the_actuator_and_throw_it_back():
     gamma, rate = (
         of("elastic_stops", "gamma")[:, 0],

@@ -8,6 +8,7 @@ import importlib.util
 import os
 import re
 from collections import defaultdict
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -54,13 +55,19 @@ FILES = {
 ROS = ("rclpy", "rcl_interfaces", "builtin_interfaces")
 
 
+@cache
+def tree(name):
+    """Syntax of a file of the package, read once for all tests."""
+    return ast.parse(FILES[name].read_text(encoding="utf-8"))
+
+
 def imports(name):
     """Every module that a file names in an import, in functions and under TYPE_CHECKING
     too.
     """
     path = FILES[name]
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(name)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -75,10 +82,9 @@ def imports(name):
                 yield full if full in FILES else base
 
 
-GRAPH = {
-    name: {one for one in imports(name) if one in FILES and one != name}
-    for name in FILES
-}
+def inner_imports(name):
+    """Modules of the package that a file imports."""
+    return {one for one in imports(name) if one in FILES and one != name}
 
 
 def room(name):
@@ -88,7 +94,7 @@ def room(name):
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_imports_from_its_own_floor_and_below(name):
     here = FLOOR[room(name)]
-    for other in GRAPH[name]:
+    for other in inner_imports(name):
         assert FLOOR[room(other)] <= here, f"{name} imports {other}"
 
 
@@ -101,13 +107,14 @@ def test_only_nodes_import_ros(name):
 
 
 def test_no_import_cycle():
-    TopologicalSorter(GRAPH).prepare()  # a CycleError names the files
+    graph = {name: inner_imports(name) for name in FILES}
+    TopologicalSorter(graph).prepare()  # a CycleError names the files
 
 
 @pytest.mark.parametrize("name", sorted({*FILES} - {"sst_ros.state"}))
 def test_no_property_holds_a_lock_that_a_fork_waits_for(name):
     """`functools.cached_property` does in Python 3.10 and 3.11; see `sst_ros.state`."""
-    for node in ast.walk(ast.parse(FILES[name].read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(name)):
         if isinstance(node, ast.ImportFrom) and node.module == "functools":
             assert "cached_property" not in {alias.name for alias in node.names}
         assert not isinstance(node, ast.Attribute) or node.attr != "cached_property"
@@ -115,8 +122,8 @@ def test_no_property_holds_a_lock_that_a_fork_waits_for(name):
 
 def test_every_class_name_has_one_definition():
     places = defaultdict(list)
-    for name, path in FILES.items():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for name in FILES:
+        for node in ast.walk(tree(name)):
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(name)
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
@@ -147,7 +154,7 @@ def test_names_of_tests_are_short():
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_constant_of_a_file_is_written_once(name):
-    body = ast.parse(FILES[name].read_text(encoding="utf-8")).body
+    body = tree(name).body
     targets = [
         target.id
         for node in body
@@ -248,6 +255,7 @@ files, where they were generated text before.
 """
 
 
+@pytest.mark.slow
 @needs("rosbags", "mcap")
 @pytest.mark.timeout(320)  # where nothing is compiled yet
 def test_calls_pass_few_files_and_those_that_contributing_names(tmp_path):

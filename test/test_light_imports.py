@@ -3,6 +3,7 @@
 
 import pytest
 from programs import python
+from slow_cases import slow_after
 
 HEAVY = {
     "scipy",
@@ -75,8 +76,10 @@ print(*sorted(set(sys.modules) - before))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "torque"), [("example2_heavy", 50.0), ("elastic_stops", 1.0)]
+    ("scene", "torque"),
+    slow_after(1, [("example2_heavy", 50.0), ("elastic_stops", 1.0)]),
 )
 def test_steps_import_nothing_after_the_code_is_loaded(scene, torque):
     """A limit or a stop met by a run in real time costs no import: it takes 0.4 s."""

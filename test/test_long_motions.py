@@ -28,6 +28,7 @@ def test_no_warning_of_a_motion_that_only_has_to_run_again():
     assert motion.evaluations > 100_000  # where a hopeless motion is warned of
 
 
+@pytest.mark.slow
 def test_a_damped_motions_energy_residual_is_its_works_error():
     scene = load("swing").with_values({"friction.gamma.viscous": 0.6})
 

@@ -5,12 +5,13 @@ import ast
 import re
 import sys
 from collections import defaultdict
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from programs import HIDDEN, python
-from slow_cases import slow_except
+from slow_cases import slow_after, slow_except
 
 from sst_ros.errors import EXTRAS, explain_missing_ros, explanation
 
@@ -53,6 +54,7 @@ def imported_names(tree):
                 yield first.value, False
 
 
+@cache
 def find_importers():
     """Return this package's modules that import each other package by a statement."""
     found = defaultdict(list)
@@ -73,27 +75,22 @@ def find_importers():
     }
 
 
-IMPORTERS = find_importers()
-
-
 def test_each_optional_import_has_an_extra():
-    assert {"pandas", "rclpy", "trimesh", "viser"} <= IMPORTERS.keys()
+    importers = find_importers()
+    assert {"pandas", "rclpy", "trimesh", "viser"} <= importers.keys()
     unexplained = [
         name
-        for name in IMPORTERS
+        for name in importers
         if explanation(ModuleNotFoundError(f"No module named {name!r}", name=name))
         is None
     ]
     assert unexplained == []
 
 
-@pytest.mark.parametrize(
-    "hidden", sorted(name for name in IMPORTERS if IMPORTERS[name])
-)
-def test_a_hidden_package_is_explained(hidden):
-    done = python(
-        HIDDEN.format(names=[hidden]) + IMPORTS.format(modules=IMPORTERS[hidden])
-    )
+def check_explanation(hidden):
+    """Hide a package; each module that imports it says how to install it."""
+    modules = find_importers()[hidden]
+    done = python(HIDDEN.format(names=[hidden]) + IMPORTS.format(modules=modules))
     for line in done.stdout.splitlines():
         message = line.partition(" ")[2]
         missing = re.match(r"(\w+) is not installed: ", message)
@@ -102,10 +99,22 @@ def test_a_hidden_package_is_explained(hidden):
             assert find_spec(missing[1]) is None, line
 
 
+@pytest.mark.parametrize("hidden", ["matplotlib", "rclpy", "viser"])
+def test_a_hidden_package_is_explained(hidden):
+    check_explanation(hidden)
+
+
+@pytest.mark.slow
+def test_each_hidden_package_is_explained():
+    for hidden, modules in find_importers().items():
+        if modules:
+            check_explanation(hidden)
+
+
 @pytest.mark.parametrize(
     "hidden", slow_except(["viser"], ["viser", "trimesh", "websockets"])
 )
-@pytest.mark.parametrize("words", [["viewer"], ["view"]], ids=" ".join)
+@pytest.mark.parametrize("words", slow_after(1, [["viewer"], ["view"]]), ids=" ".join)
 def test_the_page_names_the_extra_that_it_needs(hidden, words):
     pytest.importorskip("rclpy", reason="needs rclpy: pip install .[ros]")
     pytest.importorskip("viser", reason="needs viser: pip install .[view]")

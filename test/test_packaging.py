@@ -221,6 +221,7 @@ def test_the_parser_of_bloom_reads_every_release():
     assert total > 10  # the section of a release that is tried may be empty
 
 
+@pytest.mark.slow
 def test_the_changelog_is_restructured_text():
     core = pytest.importorskip("docutils.core")
     core.publish_doctree(RST, settings_overrides={"report_level": 1, "halt_level": 1})

@@ -68,6 +68,7 @@ def test_dir_shows_the_public_names_and_nothing_else():
     assert not hasattr(sst_ros, "nothing")
 
 
+@pytest.mark.slow
 def test_a_script_has_precise_types(tmp_path):
     pytest.importorskip("mypy", reason="types are checked by mypy")
     script = tmp_path / "script.py"

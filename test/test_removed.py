@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from slow_cases import slow_after
 
 import sst_ros
 from sst_ros import InputError, Simulation, removed, simulate
@@ -61,7 +62,7 @@ def test_commands_say_what_to_do_instead(capsys):
     assert removed.REMOVED_COMMANDS["compile"] in line
 
 
-@pytest.mark.parametrize("name", removed.REMOVED_VARIABLES)
+@pytest.mark.parametrize("name", slow_after(1, removed.REMOVED_VARIABLES))
 def test_variables_are_refused_where_code_is_compiled(name):
     command = [sys.executable, "-m", "sst_ros", "simulate", "example2"]
     result = subprocess.run(

@@ -128,6 +128,7 @@ def test_another_value_in_one_place(path, place, value):
     judged(changed(place, value), path)
 
 
+@pytest.mark.slow
 @settings(FAST, max_examples=15)
 @given(st.sampled_from(PLACES), numbers)
 def test_another_number_in_a_scene_that_is_described(path, place, value):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from loaded_scenes import loaded
 from scipy.spatial.transform import Rotation
+from slow_cases import slow_after, slow_except
 
 from sst_ros import PolynomialTorque, SineTorque, TorqueTable, load_scene, simulate
 from sst_ros.errors import InputError
@@ -67,16 +68,19 @@ def slow(*case):
 
 @pytest.mark.parametrize(
     ("kind", "at_stops"),
-    [
-        ("constant", True),
-        ("polynomial", True),
-        ("table", False),
-        slow("polynomial", False),
-        slow("constant", False),
-        slow("sine", False),
-        slow("sine", True),
-        slow("table", True),
-    ],
+    slow_after(
+        1,
+        [
+            ("polynomial", True),
+            ("constant", True),
+            ("table", False),
+            slow("polynomial", False),
+            slow("constant", False),
+            slow("sine", False),
+            slow("sine", True),
+            slow("table", True),
+        ],
+    ),
 )
 def test_sensitivities_are_the_limit_of_differences(kind, at_stops):
     """Along a random direction in all parameters at once, and in all numbers of the
@@ -166,7 +170,7 @@ def turned_by(scene, direction, size):
     )
 
 
-@pytest.mark.parametrize("at_stops", [False, True])
+@pytest.mark.parametrize("at_stops", slow_except([False], [False, True]))
 def test_sensitivities_by_geometry_are_the_limit_of_differences(at_stops):
     """At fixed initial angles and rates, so that the start moves, and the stops with
     the arcs.

@@ -130,6 +130,7 @@ def test_thin_example_2_stops_at_the_end_of_the_first_stroke():
     assert simulation.state.joints.gamma[0] < np.pi / 2
 
 
+@pytest.mark.slow
 def test_torques_of_the_inverse_dynamics_bring_the_motion_back():
     """The paper's own check, 1 s. Nothing is held: torques are functions of time within
     a step. The method's error is below rounding, and some 1000 steps of rounding at

@@ -364,7 +364,10 @@ def test_a_feedback_has_the_limit_and_the_lag_of_the_actuators():
     [
         ("swing", "auto", None),
         ("example2_heavy", "rk4", None),
-        ("gravity_payload", "auto", lambda t: (0.3 * t, -0.1, 0.2)),
+        pytest.param(
+            *("gravity_payload", "auto", lambda t: (0.3 * t, -0.1, 0.2)),
+            marks=pytest.mark.slow,
+        ),
         (
             "example2_heavy",
             "dopri5",

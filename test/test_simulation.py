@@ -13,6 +13,7 @@ import pytest
 from loaded_scenes import IGNORE, REST
 from models import seeded_samples
 from programs import python
+from slow_cases import slow_after, slow_except
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import kinetic_energy
@@ -184,7 +185,9 @@ def test_a_start_without_admissible_assembly_is_refused():
         Simulation(replace(EXAMPLE2, initial=Initial(gamma=(0.05, 0.05, 1.5))))
 
 
-@pytest.mark.parametrize("name", ["example2_heavy", "impacts", "friction"])
+@pytest.mark.parametrize(
+    "name", slow_except(["example2_heavy"], ["example2_heavy", "impacts", "friction"])
+)
 def test_a_state_within_the_last_step_is_that_of_a_shorter_step(name):
     scene = load(name)
     torque = scene.torque.at
@@ -244,7 +247,9 @@ ALIKE = {
 }
 
 
-@pytest.mark.parametrize(("scene", "torque", "within"), ALIKE.values(), ids=ALIKE)
+@pytest.mark.parametrize(
+    ("scene", "torque", "within"), slow_after(3, ALIKE.values()), ids=ALIKE
+)
 def test_a_torque_moves_as_its_function_does(scene, torque, within):
     one, other = Simulation(scene), Simulation(scene)
     one.steps(torque, 10 * MILLISECOND, 50)

@@ -11,6 +11,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from slow_cases import slow_after
 
 needs_workers = pytest.mark.skipif(
     importlib.util.find_spec("xdist") is None, reason="pytest-xdist is missing"
@@ -41,7 +42,7 @@ MODULE = "import pytest\npytest.importorskip('no_such_module')\n"
         (TEST.format(reason="llvmlite is missing"), "true", (), 1),
         pytest.param(
             *(TEST.format(reason="llvmlite is missing"), "true", ("-n", "1"), 1),
-            marks=needs_workers,
+            marks=[needs_workers, pytest.mark.slow],
         ),
         (TEST.format(reason="llvmlite is missing"), "false", (), 0),
         (MODULE, "true", (), 1),
@@ -66,7 +67,7 @@ def test_fails(name):
 
 @pytest.mark.parametrize(
     "workers",
-    [(), pytest.param(("-n", "1"), marks=needs_workers)],
+    slow_after(1, [(), pytest.param(("-n", "1"), marks=needs_workers)]),
     ids=["alone", "of a worker"],
 )
 def test_a_failure_names_the_command_that_repeats_it_alone(pytester, workers):

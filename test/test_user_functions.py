@@ -7,6 +7,7 @@ import random
 import numpy as np
 import pytest
 from programs import python
+from slow_cases import slow_after, slow_except
 
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.errors import InputError
@@ -167,12 +168,14 @@ print("same")
 """
 
 
-@pytest.mark.parametrize("attempt", range(3))
+@pytest.mark.parametrize("attempt", slow_after(1, range(3)))
 def test_the_first_use_may_be_in_threads_of_a_new_process(attempt):
     assert python(COLD).stdout.strip() == "same"
 
 
-@pytest.mark.parametrize("name", ["plain", "no HOME", "read-only HOME"])
+@pytest.mark.parametrize(
+    "name", slow_except(["no HOME"], ["plain", "no HOME", "read-only HOME"])
+)
 def test_a_new_process_needs_no_home(name, tmp_path):
     environments = {
         "plain": {},

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from slow_cases import slow_after
 
 import sst_ros
 from sst_ros import Batch, Simulation, SstError, Trajectory, load_scene, simulate
@@ -265,7 +266,7 @@ def too_long(*_):
     raise TimeoutError
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", slow_after(1, [1, 2]))
 def test_nothing_but_an_sst_error_comes_out(calls, seed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before, chosen = signal.signal(signal.SIGALRM, too_long), random.Random(seed)

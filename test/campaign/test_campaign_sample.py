@@ -16,7 +16,10 @@ from benchmark.campaign.processor import communicate, wait_for_end
 from sst_ros.errors import EXTRAS, SstError
 
 ROS = {part for part, (room, _) in PARTS.items() if room == "nodes"}
-LONG = {"bits", "estimates", "workers", "interrupts", "cold_threads", "surroundings"}
+LONG = {
+    *("bits", "cold_threads", "command_lines", "estimates", "foreign_files"),
+    *("interrupts", "invariants", "messages", "surroundings", "workers"),
+}
 NEEDS = {
     "bits": ("llvmlite",),
     "damage": ("mcap", "rosbags"),
@@ -26,7 +29,7 @@ NEEDS = {
     "sweep_parts": ("pyarrow",),
 }
 """Optional packages of a part."""
-QUICK = {"messages", *(PARTS.keys() - ROS - LONG)}
+QUICK = PARTS.keys() - ROS - LONG
 
 
 @pytest.mark.parametrize(
@@ -59,6 +62,7 @@ def test_a_finding_is_counted_and_named():
     assert "a wrong error" in ledger.notes[0]
 
 
+@pytest.mark.slow
 def test_waits_for_a_processor_are_no_hang():
     """A process that waits for its turn is not late, one that sleeps is."""
     turns = """if True:

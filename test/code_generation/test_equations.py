@@ -25,13 +25,10 @@ from sst_ros.scene.own_loads import FormulaLoad
 from sst_ros.scene.scene import names
 from sst_ros.scene.yaml_document import plain
 
-jax = pytest.importorskip("jax", reason="needs jax: pip install .[test]")
-jax.config.update("jax_enable_x64", True)  # no other test has JAX
-
 SCENES = [*names(), "loaded", "own loads"]
-QUICK = ("general", "loaded", "own loads")
-"""Scenes with every term and every function."""
-QUICK_IN_C = (*QUICK, "friction", "elastic_stops")
+QUICK = ("own loads",)
+"""The scene with every function."""
+QUICK_IN_C = ("general", "elastic_stops")
 OWN = (
     "tanh(beta_2) + positive(mu_1 - 0.1)**2"
     " + max(R11, -2) * abs(R22) / (2 + min(R33, 5))"
@@ -42,6 +39,14 @@ CLOSE = 1e-12  # relative to the largest number of a result
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", "-O1")
 FAST = ("-std=gnu11", "-O3", "-march=native")
 """Where GCC would fuse a multiplication and an addition, on a machine that can."""
+
+
+@cache
+def with_double_precision():
+    """JAX, which is imported by no other test."""
+    jax = pytest.importorskip("jax", reason="needs jax: pip install .[test]")
+    jax.config.update("jax_enable_x64", True)
+    return jax
 
 
 def scene_of(name):
@@ -123,6 +128,13 @@ def test_c_has_the_bits_of_the_package(name, tmp_path):
             )
 
 
+def import_library(name):
+    """Skip where a library is missing."""
+    if name == "jax":
+        with_double_precision()
+    pytest.importorskip(name, reason=f"needs {name}: pip install .[test]")
+
+
 def call(functions, output, state, drive):
     given = drive if output.startswith("derivative") else ()
     result = getattr(functions, output)(state, *given)
@@ -134,7 +146,7 @@ def call(functions, output, state, drive):
 @pytest.mark.parametrize("library", LIBRARIES)
 @pytest.mark.parametrize("name", slow_except(QUICK, SCENES))
 def test_a_library_of_python_has_the_values_of_the_package(name, library):
-    pytest.importorskip(library, reason=f"needs {library}: pip install .[test]")
+    import_library(library)
     functions = equations(scene_of(name), library)
     for state, drive, results in expected(name)[:2]:
         for output, result in results.items():
@@ -142,7 +154,7 @@ def test_a_library_of_python_has_the_values_of_the_package(name, library):
             assert np.abs(found - result).max() <= CLOSE * np.abs(result).max(), output
 
 
-@pytest.mark.parametrize("name", ["general", "loaded"])
+@pytest.mark.parametrize("name", slow_except(["loaded"], ["general", "loaded"]))
 def test_jacobians_are_those_of_casadi(name):
     """Derivatives by CasADi of the written derivative, against the written ones."""
     casadi = pytest.importorskip("casadi", reason="needs casadi: pip install .[test]")
@@ -206,8 +218,9 @@ def test_a_vector_or_a_list_means_each_of_its_numbers():
     assert [*keys] == [f"actuated_links[{k}].inertia.zz" for k in range(3)]
 
 
-@pytest.mark.parametrize("library", ["numpy", "jax"])
+@pytest.mark.parametrize("library", slow_except(["numpy"], ["numpy", "jax"]))
 def test_many_runs_are_further_axes(library):
+    import_library(library)
     functions = equations("friction", library, parameters=["star.inertia.zz"])
     rows = [*states(load_scene("friction"), 4)]
     state = np.stack([state for state, _ in rows], axis=1)
@@ -221,7 +234,9 @@ def test_many_runs_are_further_axes(library):
             assert np.abs(whole[..., i] - one).max() <= CLOSE * np.abs(one).max()
 
 
+@pytest.mark.slow
 def test_jax_maps_differentiates_and_keeps_single_precision():
+    jax = with_double_precision()
     functions = equations("swing", "jax")
     ((state, (torque,)),) = states(load_scene("swing"), 1)
     mapped = jax.vmap(functions.derivative, (0, None))(np.stack([state, state]), torque)

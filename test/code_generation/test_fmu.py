@@ -21,7 +21,7 @@ fmpy = pytest.importorskip("fmpy", reason="needs fmpy: pip install .[test]")
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 GAMMA = ("gamma_1", "gamma_2", "gamma_3")
-QUICK = ("elastic_stops", "friction", "general")
+QUICK = ("elastic_stops",)
 PERIOD = 0.01  # of torques that are held [s]
 COUNT = 10
 EXACT = 1e-12  # of angles [rad]
@@ -91,6 +91,7 @@ def test_co_simulation_is_the_motion_of_simulate(name, tmp_path):
     assert np.abs(found - expected(scene, torques)).max() < EXACT
 
 
+@pytest.mark.slow
 def test_contacts_with_elastic_stops_are_resolved(tmp_path):
     scene, torques = load_scene("elastic_stops"), np.tile([1.0, 0.0, 0.0], (80, 1))
     path = write(scene, tmp_path)
@@ -100,6 +101,7 @@ def test_contacts_with_elastic_stops_are_resolved(tmp_path):
     assert np.abs(found - expected(scene, torques)).max() < EXACT
 
 
+@pytest.mark.slow
 def test_fixed_steps_converge_with_order_eight(tmp_path):
     scene, torques = load_scene("fast_spin"), np.zeros((COUNT, 3))
     path, errors = write(scene, tmp_path), []
@@ -193,7 +195,7 @@ def test_what_is_not_finite_is_refused(tmp_path):
         unit.doStep(currentCommunicationPoint=0.0, communicationStepSize=PERIOD)
 
 
-@pytest.mark.parametrize("scene", slow_except([*QUICK, "loaded"], [*names(), "loaded"]))
+@pytest.mark.parametrize("scene", slow_except(["loaded"], [*names(), "loaded"]))
 def test_fmpy_finds_the_unit_valid(scene, tmp_path):
     from fmpy.validation import validate_fmu
 
@@ -204,6 +206,7 @@ def test_fmpy_finds_the_unit_valid(scene, tmp_path):
     assert validate_fmu(str(path)) == []
 
 
+@pytest.mark.slow
 def test_equal_scenes_give_equal_bytes_and_others_another_token(tmp_path):
     first, again = (equations("example2", "fmu").files for _ in range(2))
     assert first == again

@@ -132,6 +132,7 @@ def test_the_equation_of_motion_is_the_papers_with_every_load(sample, number):
     assert np.abs(found + against).max() <= bound * size
 
 
+@pytest.mark.slow
 def test_gamma_ddot_of_a_trajectory_is_the_slope_of_gamma_dot():
     motion = simulate("friction", lambda t: (math.sin(9.0 * t), 2.0 * t, -1.0), 0.5)
     times, h = np.linspace(0.1, 0.4, 7), 1e-4

@@ -10,6 +10,7 @@ import pytest
 from mechanism.test_loads import loaded
 from models import folding_star, seeded_samples
 from mpmath import mp, mpf
+from slow_cases import slow_after, slow_except
 
 from benchmark.plain_python import without_llvmlite
 from sst_ros import (
@@ -103,7 +104,7 @@ def differences(scene, y, torque, coordinates, dt):
     "coordinates", ["gamma", pytest.param("star", marks=pytest.mark.slow)]
 )
 @pytest.mark.parametrize("lag", [pytest.param(None, marks=pytest.mark.slow), 0.1])
-@pytest.mark.parametrize("dt", [None, 2e-3])
+@pytest.mark.parametrize("dt", slow_except([None], [None, 2e-3]))
 def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
     (sample,) = seeded_samples(341, 1)
     drive = Actuators(rotor_inertia=1e-4, gear_ratio=20.0, time_constant=lag)
@@ -122,6 +123,7 @@ def test_matrices_are_those_of_differences_in_50_digits(coordinates, lag, dt):
         assert np.abs(matrix - truth).max() <= 1e-10 * np.abs(truth).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 6))]
 )
@@ -150,7 +152,8 @@ def test_a_period_across_a_contact_has_the_model_of_differences(seed):
 
 
 @pytest.mark.parametrize(
-    ("name", "most_calls"), [("example2_heavy", 1), ("friction", 2), ("stiff", 25)]
+    ("name", "most_calls"),
+    slow_after(1, [("example2_heavy", 1), ("friction", 2), ("stiff", 25)]),
 )
 def test_a_period_takes_a_call_of_a_program_a_step(monkeypatch, name, most_calls):
     calls, compile_step = [], held_flow._compile_step
@@ -201,7 +204,9 @@ def test_a_start_on_a_stop_is_there_also_after_rounding():
         linearize(scene, (there, (-0.5, 0.0, 0.0)), still, dt=0.005)
 
 
-@pytest.mark.parametrize("name", ["gravity_payload", "example2_stroke", "stiff"])
+@pytest.mark.parametrize(
+    "name", slow_except(["stiff"], ["gravity_payload", "example2_stroke", "stiff"])
+)
 def test_at_an_equilibrium_nothing_accelerates(name):
     scene = load_scene(name)
     state = equilibrium(scene, scene.initial.gamma)

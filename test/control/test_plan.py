@@ -117,6 +117,7 @@ def test_demands_of_one_degree_of_freedom_are_its_closed_form():
         assert round(peaks["acceleration"].time, 6) in at
 
 
+@pytest.mark.slow
 @FAST
 @given(st.floats(0.0, 6.3), st.floats(0.5, 12.0), st.integers(40, 90))
 def test_extremes_between_samples_are_found(phase, frequency, count):
@@ -215,6 +216,7 @@ def resonant(factor=1.0):
     return replace(EXAMPLE1, springs=springs, actuators=actuators, motion=motion)
 
 
+@pytest.mark.slow
 def test_a_range_of_speeds_has_two_ends_where_slow_is_infeasible():
     """At rest the springs ask for 20 * 0.1 = 2 N m at the turning points.
 
@@ -323,6 +325,7 @@ def test_the_command_tells_verdict_and_status(capsys, tmp_path):
     assert "--period = 0.0" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_json_says_what_the_table_says(capsys):
     assert cli.main(["plan", "check", "point_to_point", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -359,6 +362,7 @@ def test_written_torques_do_the_motion(tmp_path):
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_peaks_of_reactions_are_those_of_a_fine_sampling():
     scene = load("reach")
     plan = examine_motion(reference_motion(scene), scene)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from loaded_scenes import loaded
+from slow_cases import slow_except
 
 from sst_ros import load_scene, simulate
 from sst_ros.description.mjcf import mjcf
@@ -58,7 +59,7 @@ def accelerations(scene, mobility=None):
     return np.array(found), np.array(expected)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", slow_except(["friction", "general"], names()))
 def test_accelerations_are_those_of_the_package(name):
     scene = without_dry_friction(load_scene(name))
     for mobility, bound in ((None, AS_LOADED), (MOBILITY, STIFF)):

@@ -105,7 +105,12 @@ def test_poses_of_all_links(isotropic):
             assert np.abs(read.rotation(angles, link) - rotation).max() < EXACT
 
 
-@pytest.mark.parametrize("name", names())
+some_scenes = pytest.mark.parametrize(
+    "name", slow_except(["elastic_stops", "general", "swing"], names())
+)
+
+
+@some_scenes
 def test_inertias_of_every_scene(name):
     scene = load(name)
     read = Read(scene)
@@ -245,7 +250,7 @@ def test_motion_under_gravity_with_payload_and_rotors():
     assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_motion_of_every_scene(name):
     """Inertias and weight; what URDF has not is left out of the scene."""
     scene = replace(load(name), friction=None, springs=(), own_loads=(), moment=None)
@@ -263,7 +268,7 @@ def test_motion_of_every_scene(name):
     assert np.linalg.norm(found - expected) < 1e-11 * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_mujoco_loads_every_scene(name):
     mujoco = pytest.importorskip(
         "mujoco", reason="MuJoCo is missing: pip install mujoco"
@@ -292,7 +297,7 @@ def test_mujoco_reads_it():
     assert not LINKS - {model.body(i).name for i in range(model.nbody)}
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_mujoco_loads_every_scene_as_it_is_written(name):
     """It refuses a moving body without mass or inertia.
 
@@ -309,7 +314,7 @@ def test_mujoco_loads_every_scene_as_it_is_written(name):
     assert np.isfinite(data.qacc).all()
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_every_moving_link_has_mass_and_inertia(name):
     root = ET.fromstring(urdf(load(name)))
     links = {link.get("name"): link for link in root.iter("link")}
@@ -344,7 +349,7 @@ def test_ends_limits_and_friction_are_in_it():
     assert float(effort) == 4.0
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_limits_are_those_of_a_drive(name):
     """As Pinocchio reads them: finite, above the scene's own start.
 
@@ -405,7 +410,7 @@ ON_THE_ARMS = {frozenset((STAR_LINK, carriage)) for carriage in INTERMEDIATE}
 by the others."""
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_only_carriages_touch_the_arms_of_the_star(name):
     """Planners take a robot that collides at its start as stuck."""
     scene = load(name)
@@ -550,7 +555,7 @@ def test_an_arc_begins_ends_and_stays_on_its_sphere():
     assert points[-1] @ np.cross(axis, begin) > 0.0
 
 
-@pytest.mark.parametrize("name", names())
+@some_scenes
 def test_every_scene_is_drawn(name):
     drawn = shapes(load(name))
     assert len(drawn) == 8

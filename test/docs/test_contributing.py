@@ -51,6 +51,7 @@ print(*files)
 """
 
 
+@pytest.mark.slow
 def test_the_core_is_what_a_call_of_simulate_passes():
     section = TEXT[TEXT.index("## The core") : TEXT.index("## Data paths")]
     numbered, helpers = section.split("The call also passes")

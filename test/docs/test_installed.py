@@ -46,7 +46,10 @@ def test_what_does_not_exist_is_seen(line):
     ("language", "text", "said"),
     [
         ("python", "assert 1 == 2", "AssertionError"),
-        ("bash", "true\nsst-ros scene show nowhere", "must be a readable"),
+        pytest.param(
+            *("bash", "true\nsst-ros scene show nowhere", "must be a readable"),
+            marks=pytest.mark.slow,
+        ),
         ("bash", "ros2 run sst_ros nothing", "ros2 run sst_ros nothing"),
         ("python", "# examples/push.py\nimport rclpy", "is not examples/push.py"),
         ("fortran", "END", "nobody knows what to do with fortran"),

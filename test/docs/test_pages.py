@@ -15,9 +15,10 @@ from sst_ros.cli.commands import NODE_HELP, parser
 
 PAGES = pages()
 LONG = (
-    "README batch collocation controller designers equations evaluate fast faults"
-    " follow geometry gpu identify index lockstep look many own_loads plot proof"
-    " reactions record rodas5p simulate sweep torque twelve_tasks"
+    "README batch collocation controller designers embed equations evaluate fast"
+    " faults follow geometry gpu identify index linearize lockstep look many nodes"
+    " own_loads plot proof reactions record rodas5p runge_kutta simulate sweep torque"
+    " twelve_tasks work_precision"
 )
 """Pages that start nodes or runs, which other tests do as well, or that compile."""
 WITH_BLOCKS = [

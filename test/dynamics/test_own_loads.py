@@ -90,6 +90,7 @@ def equal_motions(one, other):
     assert np.abs(a.energy - a.energy[0] - b.energy + b.energy[0]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_formulas_of_built_in_loads_move_alike():
     bare = load_scene("general")
     spring = {"springs": [{"joint": "mu_2", "stiffness": 3.0, "rest": 0.4}]}
@@ -187,6 +188,7 @@ def test_step_by_step_and_by_the_paper():
         )
 
 
+@pytest.mark.slow
 def test_parameters_of_own_loads_vary_in_batches_and_sweeps():
     scene, key = windy(), "own_loads[1].parameters[1].value"
     speeds = [0.0, 3.0, 6.0]
@@ -236,6 +238,7 @@ def test_sensitivities_by_a_parameter_of_an_own_load():
     assert np.abs(found - expected).max() < 1e-7 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 def test_motions_under_own_loads_are_proven():
     scene = replace(load_scene("general"), own_loads=windy().own_loads)
     proven = certify(scene, (0.2, 0.0, 0.0), 0.02, bound=1e-6, progress=False)

@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from slow_cases import slow_after
 
 from sst_ros import Simulation, load_scene
 from sst_ros.errors import InputError
@@ -28,7 +29,7 @@ def pair(scene, **options):
     )
 
 
-@pytest.mark.parametrize("name", ["example1", "example2"])
+@pytest.mark.parametrize("name", slow_after(1, ["example1", "example2"]))
 def test_it_gives_the_examples_of_the_paper(name):
     """Its evaluations differ by rounding, 1e-15; steps are the same."""
     scene = load_scene(name)

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from slow_cases import slow_after
 
 from benchmark.campaign.users import MEASURED_SCENE as SCENE
 from benchmark.campaign.users import exact_measurement as exact
@@ -24,7 +25,7 @@ def noisy():
     }
 
 
-KINDS = pytest.mark.parametrize("make", [exact, angles, noisy])
+KINDS = pytest.mark.parametrize("make", slow_after(1, [exact, angles, noisy]))
 
 
 @KINDS
@@ -97,7 +98,7 @@ def test_a_jump_of_an_encoder_is_refused_with_its_row(last):
         identify(data | {"gamma": gamma}, SCENE)
 
 
-@pytest.mark.parametrize("name", ["torque", "gamma"])
+@pytest.mark.parametrize("name", slow_after(1, ["torque", "gamma"]))
 def test_columns_that_do_not_change_are_told(name):
     data = angles()
     values = data[name].copy()

@@ -226,6 +226,7 @@ def test_a_recording_becomes_a_scene(written, example2, tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "actuators",
     [pytest.param(None, marks=pytest.mark.slow), Actuators(time_constant=0.02)],
@@ -252,6 +253,7 @@ def test_a_recording_is_fitted_by_simulation(written, tmp_path, capsys, actuator
     assert "takes no cutoff" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_scene_becomes_a_motion(tmp_path, capsys):
     out = tmp_path / "exciting.yaml"
     words = ["identify", "design", "example2", "--duration", "1", "--harmonics", "3"]

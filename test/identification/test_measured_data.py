@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from identification import manipulators
+from slow_cases import slow_after
 
 from sst_ros import load_scene, reference_motion
 from sst_ros.errors import InputError
@@ -89,7 +90,7 @@ def test_the_bias_of_a_short_recording_is_below_its_deviation():
     assert np.sqrt(np.mean(z**2)) > 0.5  # deviations are not bought by exaggeration
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_feedforward_errs_20_times_less_than_by_the_wrong_model(seed):
     """Along `reach`, by the identified model."""
     case = measured()
@@ -113,6 +114,7 @@ def test_noise_is_found():
     )
 
 
+@pytest.mark.slow
 def test_noise_may_be_given():
     case = measured()
     found = identify(case.recording(0), case.model)

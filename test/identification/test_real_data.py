@@ -8,6 +8,7 @@ import dataclasses
 import numpy as np
 import pytest
 from identification import manipulators
+from slow_cases import slow_after
 
 from sst_ros import read_bag
 from sst_ros.dynamics.kernel import joints, model_of
@@ -42,6 +43,7 @@ def test_95_percent_intervals_cover_93_to_97_percent_of_truths(tmp_path):
     assert 0.90 <= covered[:, delay].mean() <= 0.99
 
 
+@pytest.mark.slow
 def test_the_study_of_the_page_covers_93_to_97_percent(tmp_path):
     """The stored sets, of which two are computed again, and what the page says."""
     pandas = pytest.importorskip("pandas")
@@ -107,7 +109,7 @@ def test_a_delay_that_is_left_out_or_given():
         identify(measure(1), plant().model, ["star.mass"], "simulation", delay=DELAY)
 
 
-@pytest.mark.parametrize("delay", [-0.03, 0.05])
+@pytest.mark.parametrize("delay", slow_after(1, [-0.03, 0.05]))
 def test_delays_of_many_periods_are_found(delay):
     t, _, torque = exact()
     gamma = plant().gamma(t - delay)
@@ -136,6 +138,7 @@ def test_a_motion_with_gaps_is_cut_into_segments_with_a_word():
     assert np.abs(plant().errors(found)).max() < 5.0
 
 
+@pytest.mark.slow
 def test_seconds_since_the_epoch_and_wraps_are_taken_with_a_word():
     data = measure(6)
     expected = identify(data, plant().model)

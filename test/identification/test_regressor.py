@@ -138,6 +138,7 @@ def designed():
     return scene, design(scene, duration=4.0, harmonics=4, iterations=15)
 
 
+@pytest.mark.slow
 def test_a_designed_motion_keeps_limits_and_rests_at_both_ends(designed):
     _, found = designed
     motion = reference_motion(found.scene)
@@ -150,6 +151,7 @@ def test_a_designed_motion_keeps_limits_and_rests_at_both_ends(designed):
     assert found.scene.provenance != ()
 
 
+@pytest.mark.slow
 def test_it_is_better_conditioned_than_a_spiral_and_than_chirps(designed):
     scene, found = designed
     own, base = condition(found.scene)

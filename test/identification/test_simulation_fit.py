@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
+from slow_cases import slow_after
 from symmetric_motion import inertia
 
 from sst_ros import load_scene, simulate
@@ -99,7 +100,7 @@ def slow(*case):
         slow(bouncing, 0.05, "stroke.stiffness"),
         slow(bouncing, 0.05, "stroke.damping"),
         slow(rebounding, 1.0, "stroke.restitution"),
-        (rebounding, 1.0, "stroke.impact_rate"),
+        slow(rebounding, 1.0, "stroke.impact_rate"),
     ],
 )
 def test_sensitivities_are_derivatives_of_what_simulate_finds(build, end, name):
@@ -169,7 +170,7 @@ def test_smoothing_and_lag_are_found_though_torque_is_nonlinear():
     assert found.scene.actuators.time_constant == pytest.approx(0.02, rel=1e-6)
 
 
-@pytest.mark.parametrize("torque", [(0.3, -0.2, 0.1), None])
+@pytest.mark.parametrize("torque", slow_after(1, [(0.3, -0.2, 0.1), None]))
 def test_the_torques_of_a_trajectory_lag_once(torque):
     name, drop = "friction.gamma.viscous", {} if torque is None else {"torque": None}
     lag = {"actuators.time_constant": 0.02, name: 0.1}
@@ -185,6 +186,7 @@ def test_the_torques_of_a_trajectory_lag_once(torque):
     assert found.values == pytest.approx([0.1], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "torque", [(3.0, -2.0, 1.0), pytest.param(None, marks=pytest.mark.slow)]
 )

@@ -16,6 +16,7 @@ import pytest
 from loaded_scenes import REST
 from models import seeded_samples
 from scipy.spatial.transform import Rotation
+from slow_cases import slow_after
 
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
@@ -214,7 +215,7 @@ batch.run(many, rest, step=1e-6, count=10**8, threads={threads})
 """
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", slow_after(1, [1, 2]))
 def test_an_interrupt_ends_a_batch_at_once(threads):
     program = [sys.executable, "-c", LONG_RUN.format(threads=threads)]
     with subprocess.Popen(
@@ -323,7 +324,7 @@ LAGGING = {
 ELASTIC = {"stroke.at_end": "elastic", "stroke.stiffness": 100.0}
 
 
-@pytest.mark.parametrize("changes", [{}, LAGGING, ELASTIC])
+@pytest.mark.parametrize("changes", slow_after(1, [{}, LAGGING, ELASTIC]))
 def test_the_result_has_the_quantities_of_simulate(changes):
     """Scenario by scenario, with another inertia and amplitude in each."""
     scene = EXAMPLE2.with_values({"duration": 0.1, **changes})
@@ -399,6 +400,7 @@ def test_a_scenario_that_ends_early_has_its_last_states_time(swarm):
     assert np.all(np.isnan(result.gamma[7]))
 
 
+@pytest.mark.slow
 def test_tables_have_units_and_a_row_a_scenario(swarm):
     result = swarm.result
     pytest.importorskip("pandas", reason="tables need pandas")

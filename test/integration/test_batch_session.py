@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import slow_after
 
 from sst_ros import Batch, Simulation, load_scene
 from sst_ros.errors import InputError
@@ -62,6 +63,7 @@ def test_a_robot_that_ends_waits_until_it_is_reset():
     assert session.fault_time[4] == pytest.approx(alone.fault_time[0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_threads_and_other_numbers_of_robots_change_no_bit():
     many, few = starts(2000), 5
     session, alone = (
@@ -129,7 +131,7 @@ def test_robots_that_begin_again_have_the_bits_of_a_new_session(by, monkeypatch)
     assert np.array_equal(state.quaternion[:3], expected.quaternion)
 
 
-@pytest.mark.parametrize("limit", [None, 0.2])
+@pytest.mark.parametrize("limit", slow_after(1, [None, 0.2]))
 def test_torques_of_any_kind_act_alike_and_are_clamped(limit):
     scene = SCENE.with_values({"actuators": {"torque_limit": limit} if limit else None})
     torque = np.float64(np.float32(np.linspace(-0.5, 0.5, 27).reshape(9, 3)))

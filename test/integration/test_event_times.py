@@ -115,6 +115,7 @@ def test_the_end_of_a_stroke_is_met_when_an_arc_stands_across_it(upper, method):
     assert times[k] == min(times)
 
 
+@pytest.mark.slow
 def test_auto_follows_a_run_that_is_stiff_then_not_then_stiff():
     """A soft end with much damping: pressed against it, torn off, pressed against it
     again.

@@ -94,6 +94,7 @@ def test_a_parallel_singularity_ends_the_branch_and_says_so():
     assert ended >= 4
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 def test_coarse_and_fine_sampling_follow_the_same_branch(seed):

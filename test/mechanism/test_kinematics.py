@@ -25,6 +25,7 @@ from mechanism.closed_chains import (
 from models import FAST, assembly_of, samples
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from slow_cases import slow_after
 
 from sst_ros.errors import AmbiguousAssembly, AssemblyError, NoAdmissibleAssembly
 from sst_ros.mechanism import kinematics, virtual_work
@@ -63,7 +64,7 @@ def general(count, rng):
     ]
 
 
-@pytest.mark.parametrize("kind", [isotropic, general])
+@pytest.mark.parametrize("kind", slow_after(1, [isotropic, general]))
 @pytest.mark.parametrize(
     ("count", "hardest"),
     [(1000, 10), pytest.param(10_000, 200, marks=pytest.mark.slow)],

@@ -256,6 +256,7 @@ def test_a_payload_at_rest_hangs_in_the_joints():
     assert still.t.shape == (2,)
 
 
+@pytest.mark.slow
 def test_an_own_load_acts_where_its_formula_says():
     """A spring, a formula of its angle: the same reactions, in the joint and in all
     others.

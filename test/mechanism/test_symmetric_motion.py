@@ -9,6 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from slow_cases import slow_after
 from symmetric_motion import HOME, drift_free_rate, inertia, inertia_slope
 
 from sst_ros import Simulation, load_scene, simulate
@@ -23,7 +24,9 @@ HEAVY = EXAMPLE1.with_values(
 REST = (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("scene", [EXAMPLE1, HEAVY], ids=["example1", "star x 1.25"])
+@pytest.mark.parametrize(
+    "scene", slow_after(1, [EXAMPLE1, HEAVY]), ids=["example1", "star x 1.25"]
+)
 def test_without_drift_the_full_dynamics_return_after_one_period(scene):
     start = {"initial.gamma_dot": [drift_free_rate(scene)] * 3}
     motion = simulate(scene.with_values(start), t_eval=[np.pi / 6], tolerance=1e-14)
@@ -121,6 +124,7 @@ def test_three_contacts_at_once_bounce_as_one_freedom_does(stiffness, restitutio
     assert joints.gamma_dot[0] == pytest.approx(y[1], abs=2e-9)
 
 
+@pytest.mark.slow
 def test_stiff_stops_have_the_restitution_at_the_impact_rate():
     """The relation is exact for a constant inertia: the depth of contact is what
     remains.

@@ -11,6 +11,7 @@ import pytest
 from mechanism.closed_chains import FOLDING, ISOTROPIC, random_geometry, random_pose
 from models import assembly_of
 from scipy.spatial.transform import Rotation
+from slow_cases import slow_after
 
 from sst_ros.errors import AssemblyError, InputError, SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work, workspace
@@ -137,6 +138,7 @@ def test_the_picture_has_three_maps_a_row(isotropic, folding):
     assert len(figure.axes) == 12  # six pictures, six colour bars
 
 
+@pytest.mark.slow
 def test_no_ray_meets_a_singularity_before_the_nearest():
     """Parallel: rows r_k x t_k that are dependent; serial: t_k on the line of w_k."""
     rng, kinds = np.random.default_rng(6), set()
@@ -173,7 +175,9 @@ def test_no_ray_meets_a_singularity_before_the_nearest():
         assert np.ptp(np.sign(dependent)) == 0.0 and sine.min() > 1e-3
 
 
-@pytest.mark.parametrize("geometry", [ISOTROPIC, FOLDING], ids=["isotropic", "folding"])
+@pytest.mark.parametrize(
+    "geometry", slow_after(1, [ISOTROPIC, FOLDING]), ids=["isotropic", "folding"]
+)
 def test_nearest_to_many_poses_has_the_bits_of_each(geometry):
     around = np.random.default_rng(8).uniform(-0.02, 0.02, (120, 3))
     gamma = np.array([0.264, 0.721, 0.523]) + around

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import image
+from matplotlib.figure import Figure
 
 from sst_ros import __main__ as cli
 from sst_ros import figures
@@ -46,10 +47,9 @@ def run(tmp_path_factory, bags, example2):
     return read_signals(path)
 
 
-@pytest.fixture(scope="module")
-def drawn(run, tmp_path_factory):
-    """All pictures of a run: the figures by name, and the folder."""
-    kept, out = {}, tmp_path_factory.mktemp("pictures")
+def draw_all(run, out):
+    """Draw all pictures of a run and return the figures by name."""
+    kept = {}
     whole = pictures.save
 
     def keep(figure, title, folder, stem, formats):
@@ -61,12 +61,21 @@ def drawn(run, tmp_path_factory):
         paths, missing = draw_run(run, out)
     assert missing == {}
     assert {path.stem for path in paths} == set(kept) and len(kept) == len(RUN_PICTURES)
-    return kept, out
+    return kept
 
 
-def test_every_picture_shows_something_and_is_a_vector_too(drawn):
-    figures, out = drawn
-    for name in figures:
+@pytest.fixture(scope="module")
+def drawn(run, tmp_path_factory):
+    """All figures of a run by name; their files are empty."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda *_, **__: None)
+        return draw_all(run, tmp_path_factory.mktemp("pictures"))
+
+
+@pytest.mark.slow
+def test_every_picture_shows_something_and_is_a_vector_too(run, tmp_path):
+    out = tmp_path
+    for name in draw_all(run, out):
         pixels = image.imread(out / f"{name}.png")
         assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 300, (
             f"{name} shows no curve"
@@ -76,7 +85,7 @@ def test_every_picture_shows_something_and_is_a_vector_too(drawn):
 
 
 def test_every_axis_has_its_unit(drawn):
-    for name, figure in drawn[0].items():
+    for name, figure in drawn.items():
         if name == "sphere":
             # a map, with the joints' names along its sides
             assert not figure.axes[0].axison
@@ -95,7 +104,7 @@ def test_every_axis_has_its_unit(drawn):
 
 
 def test_curves_are_told_apart_without_colour(drawn):
-    for name, figure in drawn[0].items():
+    for name, figure in drawn.items():
         for axes in figure.axes:
             lines = [
                 line for line in axes.lines if not line.get_label().startswith("_")
@@ -107,7 +116,7 @@ def test_curves_are_told_apart_without_colour(drawn):
 
 
 def test_tracking_shows_what_was_desired_and_what_was_measured(drawn, run):
-    desired, measured = drawn[0]["tracking"].axes[0].lines
+    desired, measured = drawn["tracking"].axes[0].lines
     np.testing.assert_allclose(
         desired.get_ydata(),
         [np.degrees(sway(t)[0][0]) for t in run.seconds()],
@@ -230,6 +239,7 @@ for form in ("pdf", "png", "svg"):
 """
 
 
+@pytest.mark.slow
 def test_a_picture_on_a_full_disk(tmp_path):
     command = [sys.executable, "-c", PROGRAM, tmp_path]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100)
@@ -352,6 +362,7 @@ def test_the_command_draws_and_tells(pair, tmp_path, capsys, undrawn):
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_lacks_a_topic_is_left_out_of_its_pictures(
     pair, bags, example2, tmp_path
 ):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from slow_cases import slow_after
 
 from sst_ros import simulate
 
@@ -132,7 +133,8 @@ def test_eight_cold_threads_have_the_bits_of_one(repeat):
     assert run_code(BEGIN + THREADS) == ["8", bits_here()]
 
 
-@pytest.mark.parametrize("home", [None, "/nonexistent", "/proc"])
+@pytest.mark.slow
+@pytest.mark.parametrize("home", slow_after(1, [None, "/nonexistent", "/proc"]))
 def test_no_home_is_needed(home):
     assert run_code(BEGIN + "print(bits())", HOME=home) == [bits_here()]
 
@@ -145,6 +147,7 @@ def test_a_home_that_cannot_be_written_to_is_no_hindrance(tmp_path):
     assert list(home.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
 @pytest.mark.parametrize("repeat", REPEATS)
 def test_processes_forked_while_a_thread_compiles_have_its_bits(repeat):
@@ -189,6 +192,7 @@ assert begun.wait(60.0)
 """
 
 
+@pytest.mark.slow
 def test_a_process_ends_in_order_while_a_thread_compiles():
     """LLVM's assertions and faults ended a stopped node by SIGABRT and SIGSEGV."""
     pytest.importorskip("llvmlite")

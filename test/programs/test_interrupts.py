@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+from slow_cases import slow_except
 
 PROGRAM = """
 import os, signal, threading, time
@@ -83,7 +84,7 @@ On an idle one it takes some hundredths of a second.
 """
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", slow_except(["simulate"], CALLS))
 def test_ctrl_c_ends_a_call(name):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"needs {NEEDS[name]}")

@@ -85,15 +85,15 @@ def test_contacts_of_the_whole_motion_are_those_of_the_truth():
 def test_a_contact_begins_and_ends_when_it_is_said():
     changes = {
         "initial": {
-            "gamma": ["0.02", "0.11", "0.09"],
+            "gamma": ["0.002", "0.11", "0.09"],
             "gamma_dot": ["-1.2", "0.3", "-0.2"],
         },
         "stroke": {"at_end": "elastic", "stiffness": "9000", "damping": "0.3"},
         "workspace": {"at_edge": "ignore"},
     }
     scene, texts = documents("elastic_stops", changes)
-    proven = certify(scene, duration=0.0625, t_eval=[0.0625])
-    states, events = true_motion(proven, texts, [0.0625])
+    proven = certify(scene, duration=0.03125, t_eval=[0.03125])
+    states, events = true_motion(proven, texts, [0.03125])
     contacts = [event for event in events if event.name == "contact of gamma_1 at 0"]
     assert len(contacts) >= 2 and proven.success
     assert 0.0 < compare_rows(proven, states) <= 1.0
@@ -105,6 +105,7 @@ def spans_of(proven, events):
     return [span for event in events for span in proven.limits[event.name]]
 
 
+@pytest.mark.slow
 def test_a_clamp_begins_and_ends_when_it_is_said():
     changes = {"actuators": {"torque_limit": "2.0"}}
     scene, texts = documents("elastic_stops", changes)
@@ -117,6 +118,7 @@ def test_a_clamp_begins_and_ends_when_it_is_said():
     assert all(end - begin < NARROW for begin, end in spans_of(proven, clamps))
 
 
+@pytest.mark.slow
 def test_a_joint_turns_back_under_friction_when_it_is_said():
     law = {"coulomb": "0.3", "static": "0.45", "stribeck": "0.4", "smoothing": "0.1"}
     changes = {

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 from mpmath import mp, mpf
+from slow_cases import slow_except
 
 from sst_ros import certify
 
@@ -57,7 +58,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_except(["interval"], CASES))
 def test_a_range_that_acts_holds_at_its_corners(case):
     changes, ranges = CASES[case]
     ignore = {"workspace": {"at_edge": "ignore"}}

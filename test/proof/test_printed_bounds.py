@@ -13,6 +13,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from mpmath import mp, mpf
+from slow_cases import slow_after
 
 from sst_ros import (
     Controller,
@@ -123,7 +124,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_after(2, CASES))
 def test_columns_are_not_below_the_balls_they_are_from(case, rows):
     name, given = CASES[case]
     proven = certify(name, **given)
@@ -159,6 +160,7 @@ def check_text(text, proven):
             assert Decimal(low) <= Decimal(begin) and Decimal(high) >= Decimal(end)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["example2_stroke", "elastic_stops"])
 def test_what_is_printed_of_a_motion_is_outward(name):
     proven = certify(name, duration=0.95, t_eval=[0.3, 0.7])
@@ -173,8 +175,8 @@ def test_what_is_printed_of_a_motion_is_outward(name):
 
 def test_what_the_command_prints_and_saves_is_outward(tmp_path, capsys):
     path = tmp_path / "bounds.csv"
-    given = {"duration": 0.1, "bound": 1e-12}
-    assert main(["certify", "example2", "--duration", "0.1", "--bound", "1e-12",
+    given = {"duration": 0.02, "bound": 1e-12}
+    assert main(["certify", "example2", "--duration", "0.02", "--bound", "1e-12",
                  "--out", str(path)]) == 0  # fmt: skip
     proven = certify("example2", **given)
     check_text(capsys.readouterr().out, proven)
@@ -191,6 +193,7 @@ def compare_table(path, columns):
         ]
 
 
+@pytest.mark.slow
 def test_the_tube_of_a_loop_is_printed_and_saved_outward(tmp_path, monkeypatch, capsys):
     noted, bounds = [], certify_module.SampledLoop._bounds
 

@@ -88,7 +88,7 @@ def compare(number):
     return worst, ""
 
 
-@pytest.mark.parametrize("number", slow_except([0, 2], [0, 2, 5]))
+@pytest.mark.parametrize("number", slow_except([0], [0, 2, 5]))
 def test_a_random_corner_lies_inside(number):
     worst, reason = compare(number)
     assert not reason and worst <= 1.0

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from mpmath import mp, mpf
+from slow_cases import slow_after
 
 from sst_ros import SineTorque, certify, load_scene
 from studies.sixty_digits import Motion, angle
@@ -70,7 +71,8 @@ def compare(number):
     return *ratios, all(rates)
 
 
-@pytest.mark.parametrize("number", [0, 101])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", slow_after(1, [0, 101]))
 def test_a_random_motion_lies_inside(number):
     table, simulated, rates = compare(number)
     assert table >= 1.0 and simulated >= 1.0 and rates

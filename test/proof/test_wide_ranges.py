@@ -5,6 +5,7 @@ import math
 import re
 
 import pytest
+from slow_cases import slow_after
 
 from sst_ros import InputError, certify, load_scene
 from sst_ros.proof import certify as certify_module
@@ -99,15 +100,18 @@ def test_every_number_is_a_range_or_refused_by_name():
 
 @pytest.mark.parametrize(
     "key",
-    [
-        "base.arcs_deg[0]",
-        "star.alpha_deg[0]",
-        "star.inertia.zz",
-        "payload.mass",
-        "friction.beta.stribeck",
-        "stroke.restitution",
-        "initial.gamma[0]",
-    ],
+    slow_after(
+        1,
+        [
+            "base.arcs_deg[0]",
+            "star.alpha_deg[0]",
+            "star.inertia.zz",
+            "payload.mass",
+            "friction.beta.stribeck",
+            "stroke.restitution",
+            "initial.gamma[0]",
+        ],
+    ),
 )
 def test_what_is_too_wide_says_so(monkeypatch, key):
     monkeypatch.setattr(certify_module.ProofTask, "_needed_halvings", lambda *_: 9)
@@ -137,6 +141,7 @@ def test_what_is_no_finite_range_is_refused(width):
         certify("example2", ranges={"star.mass": width})
 
 
+@pytest.mark.slow
 def test_a_geometry_that_is_none_is_refused_with_a_width():
     times = {"duration": 0.02, "t_eval": [0.02]}
     with pytest.raises(
@@ -150,6 +155,7 @@ def test_a_geometry_that_is_none_is_refused_with_a_width():
     assert "too wide" in wider.reason
 
 
+@pytest.mark.slow
 def test_the_width_and_split_that_are_advised_would_do():
     times = {"duration": 0.1, "t_eval": [0.1]}
     proven = certify("general", ranges={"star.alpha_deg[0]": 0.2}, **times)

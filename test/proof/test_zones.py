@@ -13,6 +13,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from slow_cases import slow_except
 
 from sst_ros import (
     AssemblyError,
@@ -205,7 +206,7 @@ def zone_of(name):
     return certify_zone(scene, ranges=ranges, **CAP)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_except(["folded"], CASES))
 def test_random_poses_and_geometries_are_regular_where_proven(name):
     scene, ranges, draw = CASES[name]
     zone = certify_zone(scene, ranges=ranges, **CAP)
@@ -223,7 +224,7 @@ def test_random_poses_and_geometries_are_regular_where_proven(name):
     assert least[0] < 0.02  # the zone goes on nearly to the limits
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_except(["folded"], CASES))
 def test_no_refuted_pose_is_regular_at_the_given_geometry(name):
     scene, zone = CASES[name][0], zone_of(name)
     exact = Manipulator(scene.base.v, scene.star.alpha_deg)
@@ -258,6 +259,7 @@ def test_a_cap_is_proven_up_to_the_nearest_limit():
     assert beyond.nearest.distance < low + 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_random_angles_of_a_box_have_a_regular_assembly(tolerance):
     scene = load_scene("general")
@@ -289,6 +291,7 @@ def test_angles_beyond_a_stroke_are_refuted():
     assert zone.status_of(gamma).tolist() == [-1, 1, 0]
 
 
+@pytest.mark.slow
 def test_without_the_slope_of_det_j2_singular_poses_seem_regular(monkeypatch):
     # What the proof rests on: without its terms the random poses find singular ones.
     scene, ranges, draw = CASES["folded"]
@@ -375,6 +378,7 @@ def test_printed_shares_are_rounded_outward():
     assert Decimal(number) >= Decimal(math.degrees(zone.nearest.distance))
 
 
+@pytest.mark.slow
 def test_directions_are_shown_on_the_triangle():
     scene = load_scene("general")
     zone = certify_zone(scene, tilt=0.5, torsion=1.0, max_boxes=20_000)

@@ -170,6 +170,7 @@ def test_rosbags_reads_the_recorders_checksums_and_index(whole, entries, example
     assert recording.read(example2_bag).signals.bag.unverified > 0
 
 
+@pytest.mark.slow
 def test_a_late_flush_makes_no_large_chunk_and_keeps_no_index(tmp_path, monkeypatch):
     """What is held in memory is bounded: a chunk, and an entry of the index for each
     chunk.

@@ -143,6 +143,7 @@ def test_two_robots_in_a_bag_are_told_apart_by_their_namespaces(
     assert right.signals.namespace == "/right"
 
 
+@pytest.mark.slow
 def test_commands_read_the_run_of_a_namespace(two_robots, tmp_path, capsys):
     words = {
         "export": ["--out", str(tmp_path / "tables")],

@@ -11,6 +11,7 @@ import pytest
 from bags import SCENE, altered, edited, with_moment
 from loaded_scenes import loaded
 from scipy.integrate import solve_ivp
+from slow_cases import slow_after
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
@@ -178,13 +179,18 @@ LOADED = replace(loaded(), moment=Moment(value=(0.1, 0.2, 0.3)))
 
 @pytest.mark.parametrize(
     "some",
-    [
-        LOADED,
-        scene.load("friction"),
-        replace(LOADED, actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0)),
-        replace(EXAMPLE2, actuators=Actuators(torque_limit=2.5)),
-        replace(EXAMPLE2, actuators=Actuators(time_constant=0.02, torque_limit=2.5)),
-    ],
+    slow_after(
+        2,
+        [
+            LOADED,
+            scene.load("friction"),
+            replace(LOADED, actuators=Actuators(rotor_inertia=1e-4, gear_ratio=10.0)),
+            replace(EXAMPLE2, actuators=Actuators(torque_limit=2.5)),
+            replace(
+                EXAMPLE2, actuators=Actuators(time_constant=0.02, torque_limit=2.5)
+            ),
+        ],
+    ),
     ids=["loads", "steps in a tick", "loads and rotors", "limit", "lag and limit"],
 )
 def test_loads_and_actuators_are_compared_as_they_are(recorded, some):
@@ -224,6 +230,7 @@ def from_topic(entries):
     return edited(entries, SCENE, -1, lambda message: replace(message, data=text))
 
 
+@pytest.mark.slow
 def test_a_recorded_moment_is_used(recorded):
     moment = PUSHED.moment.value
     run = recorded(

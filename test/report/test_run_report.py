@@ -140,6 +140,7 @@ def test_the_pictures_are_pictures(whole):
     assert (np.ptp(pixels[:, :, :3], axis=2) > 0.2).sum() > 500
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_and_needs_nothing_beside_it(tmp_path, bags, lively):
     out = tmp_path / "out"
     kept = bags.without(lively, bags.DIAGNOSTICS, bags.EULER)
@@ -524,6 +525,7 @@ def test_the_last_report_says_how_often_a_torque_was_limited(bags, followed, wri
     assert read_tracking(written([*followed, said])).metrics.limited == 7
 
 
+@pytest.mark.slow
 def test_the_report_writes_a_table_and_a_picture(followed, written, tmp_path):
     told = write_tracking_report(written(followed), tmp_path)
     assert (tmp_path / "tracking.txt").read_text(encoding="utf-8") == told

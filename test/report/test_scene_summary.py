@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from loaded_scenes import IGNORE, loaded
 from models import seeded_samples
+from slow_cases import slow_after
 
 from sst_ros import __main__ as cli
 from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
@@ -118,22 +119,26 @@ def test_a_summary_has_all_parts_and_each_term_adds_or_folds(name):
 
 @pytest.mark.parametrize(
     ("change", "words", "there"),
-    [
-        ({"moment": Moment(topic=True)}, "~/external_moment", True),
-        ({"moment": Moment(value=(0.0, 0.0, 1.0))}, "~/external_moment", False),
-        ({}, "~/external_moment", False),
-        (
-            {"actuators": Actuators(time_constant=0.1)},
-            "right-hand side: 10 states",
-            True,
-        ),
-    ],
+    slow_after(
+        2,
+        [
+            ({"moment": Moment(topic=True)}, "~/external_moment", True),
+            ({"moment": Moment(value=(0.0, 0.0, 1.0))}, "~/external_moment", False),
+            ({}, "~/external_moment", False),
+            (
+                {"actuators": Actuators(time_constant=0.1)},
+                "right-hand side: 10 states",
+                True,
+            ),
+        ],
+    ),
     ids=["a moment from a topic", "a moment of its own", "no moment", "a lag"],
 )
 def test_a_summary_shows_what_a_scene_takes(change, words, there):
     assert (words in summary(replace(EXAMPLE2, **change))) is there
 
 
+@pytest.mark.slow
 def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
     assert cli.main(["scene", "show", "stiff"]) == 0
     assert capsys.readouterr().out == summary(load("stiff"))
@@ -146,9 +151,10 @@ def test_the_commands_show_list_and_check_scenes(capsys, tmp_path):
 
 
 SHIPPED = {
-    **dict.fromkeys(("example2", "gravity_payload"), ()),
+    "example2": (),
     **dict.fromkeys(
-        ("elastic_stops", "fast_spin", "friction", "stiff"), (pytest.mark.slow,)
+        ("elastic_stops", "fast_spin", "friction", "gravity_payload", "stiff"),
+        (pytest.mark.slow,),
     ),
 }
 
@@ -176,7 +182,7 @@ SCENES = [
         for name, marks in SHIPPED.items()
     ),
     *(
-        pytest.param(scene, id=f"random {k}", marks=[pytest.mark.slow] * (k == 2))
+        pytest.param(scene, id=f"random {k}", marks=pytest.mark.slow)
         for k, scene in enumerate(random_scenes())
     ),
 ]

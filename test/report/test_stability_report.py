@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 from missing_packages import needs
+from slow_cases import slow_after
 
 from sst_ros import __main__ as cli
 from sst_ros.integration.methods import METHODS
@@ -58,11 +59,14 @@ def unsure(tolerance):
 
 @pytest.mark.parametrize(
     ("kind", "only", "passes"),
-    [
-        (careless, "as-it-is", False),
-        (unsure, "as-it-is", False),
-        (unsure, "stroke", True),
-    ],
+    slow_after(
+        1,
+        [
+            (careless, "as-it-is", False),
+            (unsure, "as-it-is", False),
+            (unsure, "stroke", True),
+        ],
+    ),
 )
 def test_a_run_that_is_wrong_or_unsure_of_itself_fails(monkeypatch, kind, only, passes):
     """A run that ends where it starts has no estimate and needs none."""
@@ -114,7 +118,7 @@ def measures_at_start(scene):
     return workspace.measures(geometry, gamma, rotation)
 
 
-@pytest.mark.parametrize("kind", ["stroke", "edge", "reach"])
+@pytest.mark.parametrize("kind", slow_after(1, ["stroke", "edge", "reach"]))
 def test_a_run_at_a_limit_starts_there_and_goes_into_it(kind):
     scene = changed(kind)
     assert isinstance(scene, Scene)
@@ -128,6 +132,7 @@ def test_a_run_beside_a_singularity_starts_beside_it():
     assert min(abs(measured.det_j1), abs(measured.det_j2)) < 2e-3
 
 
+@pytest.mark.slow
 def test_the_steps_are_those_of_the_eigenvalues(found):
     assert len(found.steps) == 50 and found.steps.t_s.iloc[-1] == EXAMPLE2.duration
     assert (found.steps.rodas5p == math.inf).all()

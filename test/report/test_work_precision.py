@@ -66,6 +66,7 @@ def _rows(found, method, kind=FIXED):
     return list(rows[(rows.method == method) & (rows.kind == kind)].itertuples())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not EXACT, reason="long doubles are doubles here")
 def test_the_reference_is_mpmaths_and_better_than_doubles(short):
     """At the same steps, so that only the arithmetic differs."""
@@ -200,6 +201,7 @@ def test_a_setting_counts_only_if_every_finer_one_is_as_good(short, errors, chos
     )
 
 
+@pytest.mark.slow
 def test_another_inertia_in_the_runs_is_seen(monkeypatch):
     """A part in 1e7 of the star's inertia: no method gets near the reference."""
     inertia = dataclasses.asdict(SHORT.star.inertia)

@@ -13,6 +13,7 @@ import pytest
 
 from sst_ros import load_scene
 from sst_ros.__main__ import main
+from sst_ros.demo import record
 from sst_ros.recording.recording import read
 from sst_ros.simulation.simulation import Simulation
 from studies import paper
@@ -43,6 +44,7 @@ def out(tmp_path_factory, domain_of_module):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", PICTURES)
 def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
     summary = json.loads((out / part / "summary.json").read_text())
@@ -57,8 +59,8 @@ def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
     assert are_drawn(out / part, [*PICTURES[part], "error"])
 
 
-def test_example_2_is_the_librarys_to_the_bit_however_busy(out):
-    recording = read(out / "bag")
+def test_example_2_is_the_librarys_to_the_bit_however_busy(tmp_path, domain):
+    recording = read(record("example2", tmp_path / "run"))
     played = load_scene("example2")
     profile = played.torque.at
     simulation = Simulation(played)

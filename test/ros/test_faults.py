@@ -26,6 +26,7 @@ from ros.conftest import (
     torques,
 )
 from sensor_msgs.msg import JointState
+from slow_cases import slow_after
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -47,8 +48,8 @@ NAMED = [named([math.nan, 0.0, 0.0]), named([0.0] * 2, names=NAMES[:2])]
 @pytest.mark.parametrize(
     ("good", "bad", "because", "said"),
     [
-        (torques(*GOOD), PLAIN, "wrong size 1, not finite 1",
-         "must be 3 finite torques"),
+        pytest.param(torques(*GOOD), PLAIN, "wrong size 1, not finite 1",
+                     "must be 3 finite torques", marks=pytest.mark.slow),
         (named(GOOD[::-1], names=NAMES[::-1]), NAMED, "not finite 1, wrong names 1",
          "must be gamma_1, gamma_2, gamma_3, each once"),
     ],
@@ -202,6 +203,7 @@ def test_a_flood_of_commands_is_bounded(nodes, observer):
     assert nodes.stop(process)[0] == 0
 
 
+@pytest.mark.slow
 def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
     nodes.run("simulator")
     observer.phase("running")
@@ -214,6 +216,7 @@ def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
     assert all(call.result().success for call in calls)
 
 
+@pytest.mark.slow
 def test_kill_of_a_view_ends_its_simulator(nodes, observer):
     looking = (
         "from sst_ros.view.source import run_simulator\nwith run_simulator('swing'):"
@@ -267,7 +270,9 @@ def test_a_fault_is_held_still_until_a_reset_and_ends_the_player(
 RECORDER = pytest.param("recorder", marks=needs("rosbags", "mcap"))
 
 
-@pytest.mark.parametrize("command", ["simulator", RECORDER, "torque_player"])
+@pytest.mark.parametrize(
+    "command", slow_after(1, ["simulator", RECORDER, "torque_player"])
+)
 def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
     is_recorder = command == "recorder"
     process = nodes.run(

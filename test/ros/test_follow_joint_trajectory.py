@@ -14,6 +14,7 @@ from rclpy.action import ActionClient
 from ros.conftest import NAMES, Nodes, Observer, foreign_types
 from ros.test_inverse_dynamics import AWAY, HOME, trajectory, written
 from sensor_msgs.msg import JointState
+from slow_cases import slow_after
 from trajectory_msgs.msg import JointTrajectory
 
 from sst_ros.runtime.trajectory_messages import ErrorCode
@@ -102,7 +103,7 @@ class Client:
         return [self.tolerance(name=joint, position=position)]
 
 
-@pytest.fixture(scope="module", params=["lockstep", "free"])
+@pytest.fixture(scope="module", params=slow_after(1, ["lockstep", "free"]))
 def client(types, tmp_path_factory, request):
     """Clients of two runs, each in a domain of its own."""
     with (

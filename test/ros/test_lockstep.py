@@ -13,6 +13,7 @@ from rclpy.qos import qos_profile_sensor_data
 from ros.conftest import STAMPED, Observer, named
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from slow_cases import slow_except
 
 from sst_ros import Simulation, load_scene, simulate
 from sst_ros.recording import recording
@@ -122,7 +123,7 @@ class ControllerManager:
             self.publisher.publish(named(torque, state.header.stamp))
 
 
-@pytest.mark.parametrize("rate", [100, 500])
+@pytest.mark.parametrize("rate", slow_except([500], [100, 500]))
 def test_a_controller_manager_updates_once_for_each_sample(nodes, domain, rate):
     """The same bits whether its controller is there at once or later."""
     count = int(0.2 * rate) + 1
@@ -167,7 +168,7 @@ def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
         simulation.steps(profile((k + 0.5) * PERIOD_NS / 1e9), PERIOD_NS // 2, 2)
 
 
-@pytest.mark.parametrize("sync", ["free", "lockstep"])
+@pytest.mark.parametrize("sync", slow_except(["free"], ["free", "lockstep"]))
 def test_the_example_of_a_controller_reaches_its_goal(nodes, observer, sync):
     nodes.start("", executable=[sys.executable, str(EXAMPLE)])
     nodes.run("simulator", scene="example2", sync=sync, wait_for_command=True)

@@ -13,6 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from ros.conftest import NAMES
 from sensor_msgs.msg import JointState
+from slow_cases import slow_except
 from std_msgs.msg import String
 
 from sst_ros.errors import SstError
@@ -103,7 +104,9 @@ def give(worker, message):
     (worker.hear if isinstance(message, String) else worker.receive)(message)
 
 
-@pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
+@pytest.mark.parametrize(
+    "kind", slow_except([TorquePlayer], [TorquePlayer, InverseDynamicsController])
+)
 def test_a_fault_ends_who_commands_in_every_order_of_messages(make, kind):
     for messages in orders(PHASES, STATES):
         worker = make(kind)
@@ -125,7 +128,9 @@ def test_a_fault_is_no_concern_of_who_has_not_commanded(make, kind):
     assert len(worker._commands.sent) == 1
 
 
-@pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
+@pytest.mark.parametrize(
+    "kind", slow_except([TorquePlayer], [TorquePlayer, InverseDynamicsController])
+)
 def test_the_end_of_the_run_ends_who_commands_in_every_order(make, kind):
     """Answers that are still to be given are given first: the node looks later."""
     for messages in orders([*PHASES[:2], String(data="finished")], STATES[:3]):

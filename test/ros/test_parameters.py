@@ -14,6 +14,7 @@ import rclpy
 import yaml
 from missing_packages import needs
 from rcl_interfaces.msg import ParameterType
+from slow_cases import slow_after, slow_except
 
 from sst_ros.nodes.process import Worker
 from sst_ros.runtime.settings import NODE_COMMANDS, SimulatorParameters
@@ -89,6 +90,7 @@ def machine_latency_us():
         return None
 
 
+@pytest.mark.slow
 def test_exit_latency_is_limited_while_a_run_has_deadlines(nodes, observer):
     before = machine_latency_us()
     if not before:
@@ -279,10 +281,13 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("broken", BROKEN)
+@pytest.mark.parametrize("broken", slow_except(["types without support"], BROKEN))
 @pytest.mark.parametrize(
     ("package", "node"),
-    [("simulation_interfaces", "simulator"), ("control_msgs", "inverse_dynamics")],
+    slow_after(
+        1,
+        [("simulation_interfaces", "simulator"), ("control_msgs", "inverse_dynamics")],
+    ),
 )
 def test_an_incomplete_package_of_messages_is_left_out(
     nodes, tmp_path, package, node, broken

@@ -7,6 +7,7 @@ import pytest
 from geometry_msgs.msg import QuaternionStamped, Vector3Stamped
 from ros.conftest import NODE, torques
 from sensor_msgs.msg import JointState
+from slow_cases import slow_after
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
@@ -76,7 +77,7 @@ def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
     assert stamps(messages) == [start + k * 50_000_000 for k in range(3)]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", slow_after(1, [signal.SIGINT, signal.SIGTERM]))
 def test_signals_end_it_and_others_see_at_once_that_it_has_left(
     nodes, observer, number
 ):

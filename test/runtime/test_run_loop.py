@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from runtime.bench import Bench, HandClock, plain, run_here, stamped
+from slow_cases import slow_after
 
 from sst_ros.errors import RunStopped
 from sst_ros.integration import method_steps
@@ -286,7 +287,7 @@ def test_whatever_a_step_raises_is_a_fault_and_the_thread_lives(start, error):
     bench.to(Phase.RUNNING)
 
 
-@pytest.mark.parametrize("factor", [0.0, 1.0])
+@pytest.mark.parametrize("factor", slow_after(1, [0.0, 1.0]))
 def test_requests_do_not_put_off_the_fault_of_a_lockstep_timeout(start, factor):
     began = time.monotonic()
     bench = start(sync="lockstep", lockstep_timeout=0.5, real_time_factor=factor)
@@ -430,8 +431,8 @@ def test_code_that_cannot_be_loaded_is_a_fault(start):
     assert "internal error: OSError: no such code" in bench.loop.fault
 
 
-@pytest.mark.parametrize("sync", ["free", "lockstep"])
-@pytest.mark.parametrize("publish_clock", [True, False])
+@pytest.mark.parametrize("sync", slow_after(1, ["free", "lockstep"]))
+@pytest.mark.parametrize("publish_clock", slow_after(1, [True, False]))
 def test_no_two_states_have_one_stamp_if_the_clock_stands_still(
     start, publish_clock, sync
 ):

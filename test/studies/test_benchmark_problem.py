@@ -94,6 +94,7 @@ def test_loops_are_closed_and_the_torques_do_the_work(rows):
     np.testing.assert_allclose(energy[5:-5], work[5:-5], atol=2e-4 * energy.max())
 
 
+@pytest.mark.slow
 def test_the_papers_equations_by_scipy_give_the_rows(rows):
     problem = InitialValueProblem(load(NAME), 10_000_000)
     found, quaternions = solve_apart(problem.scene, problem.times[:21], 1e-11)

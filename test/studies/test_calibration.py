@@ -6,6 +6,7 @@ each order.
 import pickle
 
 import pytest
+from slow_cases import slow_except
 
 from sst_ros.errors import InputError, Problem, RunStopped, SingularConfiguration
 from sst_ros.mechanism.geometry import angle_between
@@ -24,7 +25,9 @@ from studies.orders import (
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(c, marks=pytest.mark.slow) if c == "sharp_friction" else c
+        pytest.param(c, marks=pytest.mark.slow)
+        if c in ("sharp_friction", "elastic_stops")
+        else c
         for c in CLASSES
     ],
 )
@@ -38,6 +41,7 @@ def test_the_estimate_holds_in_a_case_of_each_class(name):
     assert row["status"] == 2 or row["error"] <= 3.0 * row["tolerance"]
 
 
+@pytest.mark.slow
 def test_a_proven_bound_is_above_the_true_error():
     row = compare_bounds((5, 0))
     assert row["error"] <= row["bound"] < 2.0 * row["error"]
@@ -48,7 +52,7 @@ def test_a_case_depends_on_its_seed_and_number_alone():
     assert one == other
 
 
-@pytest.mark.parametrize("method", ["rk4", "dopri5", "dop853"])
+@pytest.mark.parametrize("method", slow_except(["dop853"], ["rk4", "dopri5", "dop853"]))
 def test_a_method_has_its_order_on_a_smooth_motion(method):
     table = order_table(
         data_frame(row._asdict() for row in measure_steps(("lag", method)))
@@ -65,6 +69,7 @@ def test_the_implicit_method_keeps_its_order_past_a_torque_limit():
     assert errors[0] / errors[1] > 20.0 < errors[1] / errors[2]
 
 
+@pytest.mark.slow
 def test_events_and_samples_have_errors_below_the_tolerance():
     for name in ("stop", "contact", "friction"):
         rows = measure_tolerance((name, "dop853", 1e-7))

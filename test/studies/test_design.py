@@ -22,6 +22,7 @@ from studies.design import (
 DESIGN = Design(85.0, 95.0, 80.0, 110.0, 130.0, 1.2)
 
 
+@pytest.mark.slow
 def test_the_workspace_is_the_share_of_random_orientations():
     geometry, found = Geometry.of(DESIGN.scene()), evaluate(DESIGN)
     rotation = Rotation.random(
@@ -35,6 +36,7 @@ def test_the_workspace_is_the_share_of_random_orientations():
     assert found.conditioning == pytest.approx(index, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_random_parts():
     """Assemblies of 2,000 manipulators with errors of all places, at the same measured
     angles.

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from loaded_scenes import REST
 from models import inertia_of
+from slow_cases import slow_after
 
 from sst_ros.dynamics import kernel
 from sst_ros.errors import AssemblyError, RunStopped, SingularConfiguration, SstError
@@ -48,7 +49,7 @@ def finite(state):
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(case, marks=pytest.mark.slow if number % 3 else (), id=case.name)
+        pytest.param(case, marks=pytest.mark.slow if number % 9 else (), id=case.name)
         for number, case in enumerate(CASES)
     ],
 )
@@ -75,8 +76,12 @@ def test_each_case_of_the_catalogue_has_its_value_or_its_refusal(case):
         assert done.error.time == pytest.approx(case.stop_time(), rel=1e-10, abs=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["three simultaneous contacts", "sharp Coulomb friction and three contacts"]
+    "name",
+    slow_after(
+        1, ["three simultaneous contacts", "sharp Coulomb friction and three contacts"]
+    ),
 )
 def test_three_contacts_are_three(name):
     (case,) = (case for case in CASES if case.name == name)

@@ -119,6 +119,7 @@ def test_right_and_wrong_results_are_distinguished():
     assert "rodas5p: A-stable and L-stable" in "\n".join(limits_of_theory())
 
 
+@pytest.mark.slow
 def test_the_figure_shows_every_method(tmp_path):
     figure = draw_regions({"a": np.array([-1 + 1j])})
     save_figure(figure, tmp_path / "regions.png")
@@ -129,19 +130,19 @@ def test_the_figure_shows_every_method(tmp_path):
     ] == list(METHODS)
 
 
-PROOF = needs("flint")
+LONG_PROOF = (needs("flint"), pytest.mark.slow)
 
 
 @pytest.mark.parametrize(
     ("name", "said"),
     [
         # passes no limit, which a first look cannot say
-        pytest.param("time x 10", r"\d\.\de-12 rad", marks=PROOF),
-        pytest.param("square wave of 2 N m", r"\d\.\de-1[56] rad", marks=PROOF),
+        pytest.param("time x 10", r"\d\.\de-12 rad", marks=LONG_PROOF),
+        pytest.param("square wave of 2 N m", r"\d\.\de-1[56] rad", marks=LONG_PROOF),
         pytest.param(
             "stops of 1000 N m/rad",
             r"\d\.\de-12 rad",
-            marks=[PROOF, pytest.mark.slow],
+            marks=LONG_PROOF,
         ),
         ("start at a corner that cannot be assembled", "-: there is no motion"),
         (

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from scipy import stats
+from slow_cases import slow_after
 
 from sst_ros import load_scene, sweep
 from sst_ros.control.controller import Controller, Measurement, TrackingMetrics
@@ -51,7 +52,7 @@ def gaussian(seed, rows, counter):
 
 @pytest.mark.parametrize("by", ["NumPy", "machine code"])
 @pytest.mark.parametrize(
-    "case", CASES, ids=lambda case: "-".join(map(str, case.values()))
+    "case", slow_after(1, CASES), ids=lambda case: "-".join(map(str, case.values()))
 )
 def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
     if by == "NumPy":

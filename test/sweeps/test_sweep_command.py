@@ -32,6 +32,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_its_summary_names_reasons_and_causes(folder, capsys):
     words = [
         "sweep",
