@@ -54,10 +54,10 @@ _SMALLER = 0.95  # factor by which a motion beyond a limit is made smaller
 _MOST_REDUCTIONS = 40  # then the motion has an eighth of its size
 _SAMPLE_RATE = 1000.0  # [1/s], to which standard deviations refer
 _HOMOTOPY = 8  # steps from the centre to all samples
-_NEWTON_STEPS = 2  # after each of them, which the next one corrects
+_HOMOTOPY_NEWTON_STEPS = 2  # after each of them, which the next one corrects
 _LAST_NEWTON_STEPS = 5  # after the last: to rounding
 _LARGEST_CONDITION = 1e15  # beyond which a condition number is rounding
-_IMPOSSIBLE = 1e3  # excess of a motion that no assembly has
+_EXCESS_WITHOUT_ASSEMBLY = 1e3  # excess of a motion that no assembly has
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class _Trial:
             excess = self._find_excess(gamma, quaternion, reached)
         columns = columns[..., self.base.chosen].reshape(-1, len(self.base.chosen))
         if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(excess))):
-            return np.ones_like(columns), np.array([_IMPOSSIBLE])
+            return np.ones_like(columns), np.array([_EXCESS_WITHOUT_ASSEMBLY])
         return columns, np.maximum(excess, 0.0)
 
     def _orientations(self, gamma: Array) -> Array:
@@ -246,7 +246,7 @@ class _Trial:
         quaternion = np.tile(self._start, (len(gamma), 1))
         for share in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
             angles = self.centre + share * (gamma - self.centre)
-            steps = _LAST_NEWTON_STEPS if share == 1.0 else _NEWTON_STEPS
+            steps = _LAST_NEWTON_STEPS if share == 1.0 else _HOMOTOPY_NEWTON_STEPS
             quaternion = self._space.orientations(quaternion, angles, steps)
         return quaternion
 

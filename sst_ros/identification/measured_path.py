@@ -27,7 +27,7 @@ from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
 
-_ORDER = 4  # of the Butterworth filter
+_FILTER_ORDER = 4  # of the Butterworth filter
 _SPLINE_DEGREE = 5  # accelerations are its second derivative, and are smooth
 # Highest frequency of the sines over the bandwidth of the motion: products of rates
 # double the frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in
@@ -317,7 +317,7 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
         ("cutoff", cutoff, 0.0 < cutoff < 0.5 / period, slow),
         ("t", float(t[-1] - t[0]), len(t) >= least, lasting),
     )
-    sections = butter(_ORDER, cutoff, fs=1.0 / period, output="sos")
+    sections = butter(_FILTER_ORDER, cutoff, fs=1.0 / period, output="sos")
     smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))
     return np.asarray(smooth), settled
 

@@ -62,7 +62,7 @@ LARGER = 10.0  # factor of torques and rates
 STIFFER = 100.0  # of stiffness and friction
 # margin of the workspace [rad] below which a limit is passed, and not met to rounding
 PASSED_MARGIN = -1e-9
-BISECTIONS = 40  # of the turns between two of TURNS: to rounding
+TURN_BISECTIONS = 40  # of the turns between two of TURNS: to rounding
 # of the star about each axis, up to pi: limits and singularities lie between them
 TURNS = 181
 SPIN = 1.0  # angular velocity with which a run goes from a limit into it [rad/s]
@@ -314,7 +314,7 @@ def _first_zeros(
         return axes, np.zeros(0), np.zeros((0, 3, 3))
     low = angles[first - 1]
     high = angles[first]
-    for _ in range(BISECTIONS):
+    for _ in range(TURN_BISECTIONS):
         middle = 0.5 * (low + high)
         inside = sign * values(axes, middle) > 0.0
         low = np.where(inside, middle, low)
