@@ -41,7 +41,7 @@ from sst_ros.identification.parameters import (
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_at
-from sst_ros.state import ZERO
+from sst_ros.state import QUATERNION, ZERO
 
 # samples, and points of the scene, in a period of the highest harmonic
 POINTS_A_PERIOD = 12
@@ -162,8 +162,8 @@ class _Trial:
         self._scene = scene
         self._values = parameters.values(scene, names)
         self._space = ActuatorSpaceMap(Geometry.of(scene))
-        x, y, z, w, *_ = initial_state(scene, self._space.geometry)
-        self._start = np.array([x, y, z, w])
+        start = initial_state(scene, self._space.geometry)
+        self._start = np.array(start[QUATERNION])
         self.centre = np.array(scene.initial.gamma)
         samples = POINTS_A_PERIOD * harmonics
         self.times = np.arange(1, samples + 1) * duration / samples

@@ -3,8 +3,8 @@
 
 Torques are samples at the times of the angles, or each is held over an interval, as a
 controller's are. Angles of encoders may count whole turns or wrap; stamps may be
-uneven; samples may be missing: over some of them the motion is smooth, at more of them
-it is cut into segments.
+uneven; samples may be missing: where a few are, the motion goes on smoothly; at a
+longer gap it is cut into segments.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 Known: TypeAlias = NDArray[np.bool_]
-"""Of each interval between samples whether its torque is known."""
+"""Whether the torque of each interval between samples is known."""
 
 Measured: TypeAlias = Union["Recording", Trajectory, Mapping[str, Any]]
 
@@ -102,9 +102,9 @@ class Segments(NamedTuple):
 
 
 def read_motion(data: Measured) -> MeasuredMotion:
-    """Read a motion from a recording, a trajectory, or arrays, or refuse it.
+    """Read a motion from a recording, a trajectory, or arrays; see `identify`.
 
-    What is allowed is described in `identify`.
+    Raises InputError where it is none.
     """
     return _read(data).motion
 

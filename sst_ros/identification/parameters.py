@@ -86,8 +86,8 @@ ROTOR_INERTIA = "actuators.rotor_inertia"
 def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
     """Return names of parameters of a scene: all, or the `requested` ones.
 
-    A name counts that begins as in ("star", "friction.gamma", "offset"); a beginning of
-    none is refused.
+    A request is how names begin, as "star", "friction.gamma" or "offset". Raises
+    InputError where no name begins so.
     """
     own, optional = _list_names(scene)
     if requested is None:
@@ -149,9 +149,9 @@ def _key_of(name: str) -> str:
 def with_parameters(
     scene: Scene, names: Sequence[str], numbers: Array, note: str
 ) -> Scene:
-    """Return the scene with identified values, or refuse them.
+    """Return the scene with identified values, and a note of their provenance.
 
-    A note of their provenance is added.
+    Raises InputError where no bodies have these values.
     """
     by_name = dict(zip(names, (float(number) for number in numbers), strict=True))
     changed: dict[str, Any] = {}
@@ -180,8 +180,8 @@ def with_parameters(
 def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
     """List names of what the scene has, and of what may be asked for besides.
 
-    Equal links are named alike. What may be asked for besides are links alone or alike,
-    friction that is not yet known, and offsets.
+    Three equal links of a scene have one name. Besides, links may be asked for alone or
+    alike, and so may friction and rotors that the scene does not have, and offsets.
     """
     own = _list_inertial(scene, "star")
     optional: list[str] = []

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sst_ros.dynamics.kernel import Model, joints, model_of
-from sst_ros.dynamics.traced_dynamics import STATE_SIZE
 from sst_ros.dynamics.variational import VariationalEquations
 from sst_ros.errors import InputError, refuse_unless
 from sst_ros.identification import contradictions, parameters
@@ -27,6 +26,7 @@ from sst_ros.identification.regression import RegressionEquations
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import find_number
+from sst_ros.state import STAR
 
 # keys of numbers that must stay positive: of what has a size, not a direction
 POSITIVE = re.compile(
@@ -162,12 +162,12 @@ def _compare_angles(
     The angles have the shape (3 n,), their derivatives by the p values (3 n, p).
     """
     states, state_slopes = motion.run(values, times)
-    body_states = states[:, :STATE_SIZE].T  # without lagged torques
+    body_states = states[:, STAR].T  # without lagged torques
     computed = np.stack(joints(model, tuple(body_states)).gamma, axis=1)
     turned = np.exp(1j * (computed - gamma))  # without whole turns
     by_state = motion.differentiate_joints(body_states)
     gamma_by_state, _ = np.split(by_state, 2, axis=1)  # of gamma and of gamma_dot
-    slopes = np.einsum("qcn,nqp->ncp", gamma_by_state, state_slopes[:, :STATE_SIZE])
+    slopes = np.einsum("qcn,nqp->ncp", gamma_by_state, state_slopes[:, STAR])
     return np.angle(turned).ravel(), slopes.reshape(-1, len(values))
 
 

@@ -22,7 +22,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from pandas import DataFrame, Series
 
-from sst_ros.dynamics.traced_dynamics import STATE_SIZE
 from sst_ros.errors import SstError
 from sst_ros.figures import INK, MARKERS, Looks, note, styled
 from sst_ros.integration.many_runs import run_many
@@ -40,7 +39,7 @@ from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
-from sst_ros.state import cached_property
+from sst_ros.state import STAR, cached_property
 
 FIXED = "fixed steps"
 TOLERANCE_KIND = "tolerance"
@@ -112,7 +111,7 @@ class WorkPrecision:
 
         So it is with scenes that a controller drives along a reference motion.
         """
-        states = self.reference.states[:, :STATE_SIZE]
+        states = self.reference.states[:, STAR]
         return bool(np.abs(states - states[0]).max() < REFERENCE_ROUNDING)
 
     def best(self, target: float) -> Series[Any] | None:
@@ -264,7 +263,7 @@ def _refine(
 def _measure(
     setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
 ) -> dict[str, Any]:
-    """Run one setting: its row of the grid."""
+    """Run one setting, and return its row of the grid."""
     row: dict[str, Any] = {
         "method": setting.method,
         "kind": setting.kind,
@@ -282,7 +281,7 @@ def _measure(
                 turns = min(MOST_TIMINGS, max(2, int(TIMING_S / wall)))
                 wall = min(wall, *timeit.repeat(setting.timed, number=1, repeat=turns))
             row["wall_min_s"] = wall
-            if not np.isfinite(run.states[:, :STATE_SIZE]).all():
+            if not np.isfinite(run.states[:, STAR]).all():
                 raise ArithmeticError("not finite")
             final, largest = problem.errors(run.states, truth.states)
             useful = largest.orientation <= USELESS and math.isfinite(largest.gamma_dot)
@@ -338,6 +337,7 @@ def name_fastest(study: WorkPrecision) -> str:
 
 
 def _setting(row: Series[Any]) -> str:
+    """Name a setting, with its computing time."""
     setting = f"{1e3 * row.setting:.4g} ms steps"
     if row.kind == TOLERANCE_KIND:
         setting = f"tolerance {row.setting:.0e}"

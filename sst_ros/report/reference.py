@@ -34,7 +34,7 @@ from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, QUATERNION
 
 
 class HeldTicks(NamedTuple):
@@ -402,7 +402,7 @@ def _compare(
 
 def _joints(model: kernel.Model, states: Array) -> _Samples:
     """Return unit quaternions and joints of states, shape (n, 7 or more)."""
-    quaternion, _ = np.split(states, (4,), axis=1)
+    quaternion = states[:, QUATERNION]
     joints = kernel.joints(model, tuple(states.T))
     return _Samples(
         quaternion / np.linalg.norm(quaternion, axis=1)[:, None],

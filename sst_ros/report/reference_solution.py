@@ -36,11 +36,9 @@ from sst_ros.report.results import WHOLE_RUN_S
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import NANOSECONDS, ZERO
+from sst_ros.state import NANOSECONDS, QUATERNION, ZERO
 
 LongArray: TypeAlias = NDArray[np.longdouble]
-_QUATERNION = slice(0, 4)  # its part of a state
-
 _MOST_REFERENCE_STEPS = 25_000  # in extended precision: half a minute's work
 # Changes of the orientation from one solution to the next [rad]: of one that extended
 # precision does not resolve further, and the largest of a reference.
@@ -129,7 +127,7 @@ class InitialValueProblem:
         Their states have the shape (m, 7 or more). Distances are nan where unknown.
         """
         orientation = angle_between(
-            solution[:, _QUATERNION], reference[:, _QUATERNION]
+            solution[:, QUATERNION], reference[:, QUATERNION]
         ).astype(float)
         joints = np.abs(self.joints(solution) - self.joints(reference)).max(axis=1)
         distances = np.vstack([orientation, joints])
@@ -280,7 +278,7 @@ def run_extended(problem: InitialValueProblem, steps: int) -> LongArray:
         for k in range(problem.count * steps):
             step = explicit_step(derivative, EXACT_DOP853, k * h, h, [*y], stages)
             y = np.array(step.state)
-            quaternion = y[_QUATERNION]
+            quaternion = y[QUATERNION]
             quaternion /= np.sqrt(quaternion @ quaternion)
             if (k + 1) % steps == 0:
                 result[(k + 1) // steps] = y

@@ -207,4 +207,5 @@ def stability_function(
 
 
 def _combine(weights: tuple[float, ...], stages: list[Any]) -> Any:
+    """Return the weighted sum of stages; the last weights may have no stage yet."""
     return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)

@@ -323,6 +323,7 @@ def _first_zeros(
 
 
 def _measure(scene: Scene, rotation: Array) -> workspace.Measures:
+    """Return the measures of the workspace at orientations, shape (n, 3, 3)."""
     geometry = Geometry.of(scene)
     return workspace.measures(
         geometry, kinematics.inverse(geometry, rotation)[0], rotation

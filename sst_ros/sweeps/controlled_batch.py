@@ -33,7 +33,7 @@ from sst_ros.mechanism.generic_math import axpy, cos, dot3, log, positive, selec
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.programs.columns import ColumnFunction, compile_columns
 from sst_ros.programs.expression import Expression, divide, trace
-from sst_ros.state import NANOSECONDS, cached_property
+from sst_ros.state import NANOSECONDS, TORQUES, cached_property
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 CONTROL_NEWTON_STEPS = 5
@@ -62,8 +62,6 @@ GAINS = {
 
 _NOISE = 6
 """Normal numbers that a sample takes: of three angles and three rates."""
-
-_SENT = slice(0, 3)  # torques of the actuators among the numbers of a column
 
 
 # Normal noise from a counter: number c of row i depends on the seed, i and c alone. The
@@ -138,7 +136,7 @@ class ControlledBlock(Block):
             *self._gains,
             self.running,
         ]
-        results = [*self.given[_SENT], *self._memory]
+        results = [*self.given[TORQUES], *self._memory]
         self._answer = [
             feedback.answer.bind([*self.states(which), *inputs], results)
             for which in (0, 1)
@@ -158,7 +156,7 @@ class ControlledBlock(Block):
         _, drives, code, *_ = columns
         memory = self._feedback.memory
         number = len(code[columns_of_block])  # the last block may have fewer
-        drives[_SENT, columns_of_block] = self.given[_SENT, :number]
+        drives[TORQUES, columns_of_block] = self.given[TORQUES, :number]
         memory[:, columns_of_block] = self._memory[:, :number]
 
     def prepare_step(self, number: int) -> None:
@@ -387,7 +385,7 @@ class ControlledBatch:
             advance_blocks(block, range(0, count, width), first, number, step, *columns)
             if kept and (first + number) % kept == 0:
                 _, drives, *_ = columns
-                sent.append(drives[_SENT].copy())
+                sent.append(drives[TORQUES].copy())
 
         step = self.samples * self._control.period / steps
         result = batch.run(
