@@ -38,7 +38,7 @@ Measured: TypeAlias = Union["Recording", Trajectory, Mapping[str, Any]]
 FEWEST = 20
 GAP = 10.0  # periods without a sample from which a motion is cut
 EVEN = 1e-3  # share of a period by which even samples may be off
-CLOCK_ROUNDING = 1e-9  # of the times of ticks [s], which are whole nanoseconds
+CLOCK_STEP_NS = 1.0  # of the times of ticks [ns]
 _SHOWN_GAPS = 5  # in a note
 # torques that are constant from break to break
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
@@ -283,12 +283,8 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     first_quaternion = next(iter(quaternions[rows]), None)
     if first_quaternion is not None and np.isfinite(first_quaternion).all():
         samples["quaternion"] = first_quaternion
-    # How long torques are known from the start on, up to each sample.
-    edges = np.stack([begins, ends], axis=1).ravel()
-    lengths = np.stack([ends - begins, np.zeros(len(begins))], axis=1).ravel()
-    so_far = np.append(0.0, np.cumsum(lengths))[:-1]
-    with_torque = np.diff(np.interp(t, edges, so_far))
-    return samples, with_torque > np.diff(t) - CLOCK_ROUNDING
+    times_ns = t * NANOSECONDS
+    return samples, ticks.known_between(times_ns) > np.diff(times_ns) - CLOCK_STEP_NS
 
 
 def _average(law: torques.TorqueProfile, t: Array) -> Array:

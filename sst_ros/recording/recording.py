@@ -13,10 +13,10 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import model_of
@@ -397,6 +397,17 @@ class Ticks:
         """How often a tick does not begin where the one before ended."""
         return int(np.count_nonzero(self.start_ns[1:] != self.end_ns[:-1]))
 
+    def known_between(self, times_ns: NDArray[Any]) -> Array:
+        """Return for how long [ns] torques are known from each time to the next.
+
+        There are n times [ns], and n - 1 intervals.
+        """
+        edges = np.stack([self.start_ns, self.end_ns], axis=1).ravel()
+        length = self.end_ns - self.start_ns
+        steps = np.stack([length, 0 * length], axis=1).ravel()
+        known_ns = np.append(0, np.cumsum(steps))[:-1]  # up to each edge
+        return np.diff(np.interp(times_ns, edges, known_ns))
+
 
 class Recording(Explained, ReadOnly):
     """A run from all tables of its bag. Samples are in order of time.
@@ -691,11 +702,7 @@ class Recording(Explained, ReadOnly):
         """
         begin = time_ns[:-1]
         end = time_ns[1:]
-        edges = np.stack([self.ticks.start_ns, self.ticks.end_ns], axis=1).ravel()
-        length = self.ticks.end_ns - self.ticks.start_ns
-        steps = np.stack([length, 0 * length], axis=1).ravel()
-        known_ns = np.append(0, np.cumsum(steps))[:-1]  # with a torque, up to each edge
-        with_torque_ns = np.diff(np.interp(time_ns, edges, known_ns))
+        with_torque_ns = self.ticks.known_between(time_ns)
         longer = end - begin > 1.5 * self.period_ns
         lost = longer & (with_torque_ns < (end - begin) - 0.5)
         return list(zip(begin[lost].tolist(), end[lost].tolist(), strict=True))
