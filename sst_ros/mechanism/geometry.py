@@ -53,11 +53,13 @@ class Geometry(Explained):
     beta_max: Any  #: largest admissible beta_k [rad]
 
     def _facts(self) -> dict[str, object]:
-        arcs_deg, alpha_deg = np.degrees(self.arc), np.degrees(self.alpha)
+        arcs_deg = np.degrees(self.arc)
+        alpha_deg = np.degrees(self.alpha)
         facts: dict[str, object] = {}
-        if self.v.ndim > 2:
+        if self.v.ndim > 2:  # many geometries, of which the first is shown
             facts["geometries"] = len(self.v)
-            arcs_deg, alpha_deg = arcs_deg[0], alpha_deg[0]
+            arcs_deg = arcs_deg[0]
+            alpha_deg = alpha_deg[0]
         else:
             for leg, vertex in enumerate(self.v.tolist(), start=1):
                 facts[f"P{leg} in {{B}}, unit vector"] = vertex
@@ -89,7 +91,8 @@ class Geometry(Explained):
         """
         directions = np.array(v, dtype=float)
         shape = directions.shape
-        alpha_shape, beta_shape = np.shape(alpha), np.shape(beta_max)
+        alpha_shape = np.shape(alpha)
+        beta_shape = np.shape(beta_max)
         fits = shape[-2:] == (3, 3) and alpha_shape == shape[:-1]
         fits = fits and beta_shape in ((), shape[:-2])
         shapes = (shape, alpha_shape, beta_shape)
@@ -101,7 +104,8 @@ class Geometry(Explained):
         sines = np.linalg.norm(normals, axis=-1)
         cosines = np.einsum("...j,...j->...", directions, following)
         angles = np.array(alpha, dtype=float)
-        alpha_12, alpha_23 = angles[..., 0], angles[..., 1]
+        alpha_12 = angles[..., 0]
+        alpha_23 = angles[..., 1]
         zero = np.zeros_like(alpha_12)
         turns = np.stack([zero, alpha_12, alpha_12 + alpha_23], axis=-1)
         e = np.stack([-np.sin(turns), np.cos(turns), np.zeros_like(turns)], axis=-1)
@@ -113,7 +117,7 @@ class Geometry(Explained):
 
     @classmethod
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
-        """Derive distinct geometries of `Scenarios`, and the index of each row's."""
+        """Derive the distinct geometries of `Scenarios`, and the index of each row's."""
         scene = scenarios.document
         columns_by_key = [scenarios.rows.get(key) for key in KEYS]
         varied = []
@@ -122,27 +126,24 @@ class Geometry(Explained):
                 varied.append(values.reshape(len(values), -1))
         if not varied:
             return cls.of(scene), np.zeros(scenarios.count or 1, dtype=np.intp)
-        _, first, index = np.unique(
+        _, first_rows, geometry_of_row = np.unique(
             np.hstack(varied), axis=0, return_index=True, return_inverse=True
         )
         nominal = scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg
         arrays = []
         for values, value in zip(columns_by_key, nominal, strict=True):
             if values is None:
-                arrays.append(np.repeat([value], len(first), axis=0))
+                arrays.append(np.repeat([value], len(first_rows), axis=0))
             else:
-                arrays.append(values[first])
+                arrays.append(values[first_rows])
         v, alpha_deg, beta_max_deg = arrays
         distinct = cls.build(v, np.radians(alpha_deg), np.radians(beta_max_deg))
-        if len(first) == 1:  # one for all rows: its numbers are no columns
+        if len(first_rows) == 1:  # one for all rows: its numbers are no columns
             distinct = cls.build(distinct.v[0], distinct.alpha[0], distinct.beta_max[0])
-        return distinct, index.ravel()
+        return distinct, geometry_of_row.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
-        """Return the geometries of rows, or of a row.
-
-        This one where it is a single one.
-        """
+        """Return the geometries of rows, or of a row; a single geometry is that of all."""
         if self.v.ndim == 2:
             return self
         return Geometry(*(array[rows] for array in vars(self).values()))
@@ -172,7 +173,10 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     if np.any(length == 0.0):
         raise ValueError("a quaternion of length zero is no rotation")
     x, y, z, w = np.moveaxis(q / length, -1, 0)
-    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    ww = w * w
     rows = (
         (xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
         (2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
@@ -192,7 +196,8 @@ def quaternion_of(rotation: ArrayLike) -> Array:
     trace = np.trace(m, axis1=-2, axis2=-1)
     w = 3  # index of the real part; i, j, k are those of the others
     # Row n is four times component n times the whole quaternion.
-    products = np.empty((*m.shape[:-2], 4, 4))
+    *stack_shape, _, _ = m.shape
+    products = np.empty((*stack_shape, 4, 4))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         products[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
         products[..., i, j] = m[..., j, i] + m[..., i, j]
@@ -233,7 +238,7 @@ def zyz_angles(rotation: ArrayLike) -> Array:
 def unwrap_zyz(angles: ArrayLike) -> Array:
     """Return ZYZ angles [rad] of a trajectory without jumps, shape (n, 3).
 
-    The given angles are as from `zyz_angles`.
+    `angles` are as `zyz_angles` returns them.
 
     (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a
     motion straight through the pole is smooth in angles if phi may change its sign.
@@ -253,7 +258,7 @@ def unwrap_zyz(angles: ArrayLike) -> Array:
 
 
 def _nearest_form(angles: Array, reference: Array) -> Array:
-    """Return the form of ZYZ angles that is nearest to others, shape (3,) each."""
+    """Return the form of ZYZ angles that is nearest to a reference, shape (3,) each."""
     theta, phi, psi = angles
     half_turn = np.pi
     if phi in (0.0, np.pi):

@@ -50,11 +50,13 @@ Mask = NDArray[np.bool_]
 NEAR = 0.1  # how near an assembly must be to the rotation that names it [rad]
 CLOSURE_ROUNDING = 1e-15  # largest abs(r_k . t_k) that is rounding and not a residual
 NOT_ISOLATED = 1e-13  # quartic forms with smaller coefficients vanish identically
+# The next three choose what is polished and compared: larger ones cost time only,
+# smaller ones may lose a root.
 NEAR_REAL = 1e-3  # imaginary part, over 1 + abs(z)^2, of a root that may be real
 SAME_ROOT = 1e-3  # entries of two rotations that may be one root differ by less
 MISFIT = 1e-2  # residual of leg 2 or 3 at an angle y that is worth polishing
-POSE_NEWTON_STEPS = 40
-LONGEST_TURN = 0.3  # of a Newton step [rad]
+POSE_NEWTON_STEPS = 40  # at most: each halves the distance to a double root
+LONGEST_TURN = 0.3  # of a Newton step [rad]: a longer one may leave the root's vicinity
 LAST_STEP = 1e-9  # a Newton step [rad] after which rounding is reached
 REGULAR = 1e-5  # abs(det J2) above which a Newton step is solved by the adjugate
 SMALLEST = 1e-300  # divisor in place of zero
@@ -123,14 +125,10 @@ def inverse(
     InputError refuses other shapes.
     """
     matrices = np.asarray(rotation, dtype=float)
+    shape = matrices.shape
     refuse_unless(
         "inverse",
-        (
-            "rotation",
-            matrices.shape,
-            matrices.shape[-2:] == (3, 3),
-            "must be (..., 3, 3)",
-        ),
+        ("rotation", shape, shape[-2:] == (3, 3), "must be (..., 3, 3)"),
         ("signs", signs, np.shape(signs) == (3,), "must be three of 1 and -1"),
     )
     t = star_axes(geometry, matrices)
@@ -160,11 +158,11 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
         raise AssemblyError("the assemblies are not isolated", angles)
     return [
         Assembly(
-            assemblies.rotation[row],
-            assemblies.mu[row],
-            assemblies.beta[row],
-            float(assemblies.det_j2[row]),
-            bool(assemblies.admissible[row]),
+            rotation=assemblies.rotation[row],
+            mu=assemblies.mu[row],
+            beta=assemblies.beta[row],
+            det_j2=float(assemblies.det_j2[row]),
+            admissible=bool(assemblies.admissible[row]),
         )
         for row in range(len(assemblies.rotation))
     ]
@@ -274,11 +272,12 @@ def describe_assemblies(
 
 
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
-    """Solve r_k . R e_k = 0 for n configurations with r and e, (n, 3, 3) each.
+    """Solve r_k . R e_k = 0 for many configurations at once.
 
-    Rows are unit vectors, e_1 = (0, 1, 0). Returns the configuration of each root,
-    ascending, (m,); the rotations, (m, 3, 3), in the order of `direct`; and whether the
-    roots of a configuration are isolated, (n,): where they are not, none is given.
+    The letters are those of this module's docstring. r and e have the configuration
+    first, then rows of unit vectors by leg; e_1 = (0, 1, 0). Returns the configuration
+    of each root, ascending; the rotations, in the order of `direct`; and whether the
+    roots of each configuration are isolated: where they are not, none is given.
     """
     r_1 = r[:, 0]
     directions = r[:, 1:]  # r_2 and r_3
@@ -288,7 +287,8 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     along_n = (directions @ n[:, :, None])[..., 0]
     along_m = (directions @ m[:, :, None])[..., 0]
     along_r = (directions @ r_1[:, :, None])[..., 0]
-    e_x, e_y = e[..., 1:, 0], e[..., 1:, 1]
+    e_x = e[..., 1:, 0]
+    e_y = e[..., 1:, 1]
     # For each configuration and legs 2 and 3: two coefficients, of cos x and sin x, in
     # a and c; one number in b.
     a = e_x[..., None] * np.stack([-along_m, along_n], axis=-1)
@@ -317,23 +317,28 @@ def _largest(rows: Array) -> Array:
     return np.asarray(np.maximum(np.maximum(first, second), third))
 
 
+# where the coefficients of a quadratic form are in one of degree four
+TIMES_COSINE_SQUARED = slice(0, 3)
+TIMES_SINE_SQUARED = slice(2, 5)
+
+
 def _quartic(a: Array, b: Array, c: Array) -> Array:
     """Coefficients of cos^4 x, cos^3 x sin x, ..., sin^4 x, shape (n, 5).
 
     The form is that of cos(y)^2 + sin(y)^2 - 1, where (cos y, sin y, 1) is the cross
     product of the rows (a, b, c) of legs 2 and 3.
     """
-    a_2, a_3 = a[:, 0], a[:, 1]
-    b_2, b_3 = b[:, :1], b[:, 1:]
-    c_2, c_3 = c[:, 0], c[:, 1]
+    a_2, a_3 = np.moveaxis(a, 1, 0)
+    b_2, b_3 = b.T[:, :, None]
+    c_2, c_3 = np.moveaxis(c, 1, 0)
     cosine = b_2 * c_3 - b_3 * c_2
     scale = a_2 * b_3 - a_3 * b_2
     sine = _product(c_2, a_3) - _product(a_2, c_3)
     form = _product(sine, sine)
     quadratic = _product(cosine, cosine) - _product(scale, scale)
     # The quadratic form becomes one of degree four by the factor cos^2 x + sin^2 x = 1.
-    form[:, :3] += quadratic  # times cos^2 x
-    form[:, 2:] += quadratic  # times sin^2 x
+    form[:, TIMES_COSINE_SQUARED] += quadratic
+    form[:, TIMES_SINE_SQUARED] += quadratic
     return form
 
 
@@ -350,7 +355,8 @@ def _turn_forms(count: int) -> tuple[Array, Array]:
     angles = np.arange(count) * np.pi / count
     matrices = np.zeros((count, 5, 5))
     for turn, angle in enumerate(angles):
-        cosine, sine = np.cos(angle), np.sin(angle)
+        cosine = np.cos(angle)
+        sine = np.sin(angle)
         for power in range(5):
             # cos^(4 - power) x sin^power x, each factor by cosine and sine of x - x_0
             term = np.ones(1)
@@ -375,7 +381,8 @@ def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
     divisor = np.where(isolated, turned[:, 0], 1.0)
     companion = np.zeros((len(form), 4, 4))
     companion[:, 0] = -turned[:, 1:] / divisor[:, None]
-    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    column = np.arange(3)
+    companion[:, column + 1, column] = 1.0
     z = np.linalg.eigvals(companion)
     square = z.real**2 + z.imag**2
     # z = cot(x - x_0)
@@ -428,8 +435,11 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
         if not moves.any():
             break
         if not moves.all():
-            active, rotation = active[moves], rotation[moves]
-            r, e, t = r[moves], e[moves], t[moves]
+            active = active[moves]
+            rotation = rotation[moves]
+            r = r[moves]
+            e = e[moves]
+            t = t[moves]
             residual = residual[moves]
         step = _newton_step(cross(t, r), residual)
         length = np.sqrt(dot(step, step))
@@ -442,7 +452,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
 
 def _newton_step(slope: Array, residual: Array) -> Array:
     """Solve slope step = -residual, by the shortest step where nearly singular."""
-    first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
+    first, second, third = np.moveaxis(slope, 1, 0)
     # A^-1 is the adjugate over the determinant; its columns are these vector products.
     adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
     determinant = dot(first, adjugate[:, :, 0])
@@ -475,7 +485,7 @@ def _turn_vector(vector: Array, step: Array) -> Array:
 
 
 def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index, Array]:
-    """Keep one of each root; t_1 and -t_1 count as the same here."""
+    """Keep one solution of each root; those of t_1 and -t_1 count as one here."""
     if not len(owner):
         return owner, rotation
     fresh = np.ones(len(owner), dtype=bool)
@@ -501,7 +511,7 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
 
 
 def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
-    """Sort, and set the partner R Rot(z, pi) beside each root."""
+    """Sort the roots, and insert the partner R Rot(z, pi) beside each."""
     s_x, s_y, s_z = np.round(rotation[:, :, 2], SORTED_DIGITS).T
     order = np.lexsort((s_x, s_y, s_z, owner))
     owner = owner[order]

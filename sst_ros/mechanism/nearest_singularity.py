@@ -41,15 +41,17 @@ from sst_ros.mechanism.geometry import (
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import Explained
 
-RAYS = 400  # from a pose, along which det J2 is looked at
+RAYS = 400  # from a pose, along which det J2 is evaluated
 RAY_POINTS = 64  # of a ray: two changes of sign between two of them are overlooked
 REFINED = 6  # nearest changes of sign that are refined
 SINGULAR = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 POSES_AT_ONCE = 100  # some 100 MB of polynomials along rays
 NEWTON_STEPS = 60  # most of them; a start beside a solution takes five
-LONGEST_STEP = 0.2  # of v
+LONGEST_STEP = 0.2  # of v: a longer one may lead to another solution
 LAST_STEP = 1e-9  # of v: after it rounding is reached, for convergence is quadratic
 FLAT = 1e-200  # squared gradient below which there is no direction to a solution
+DEGREE = 6  # of det J2 along a ray as a polynomial in tau
+SHORT_OF_SERIAL = 1.0 - 1e-9  # share of a ray; at its end det J2 is zero in any case
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,11 +97,11 @@ class NearestSingularities(Explained):
     def __getitem__(self, pose: int) -> NearestSingularity:
         """Return that of one pose."""
         return NearestSingularity(
-            str(self.kind[pose]),
-            int(self.leg[pose]),
-            float(self.distance[pose]),
-            self.axis[pose],
-            self.rotation[pose],
+            kind=str(self.kind[pose]),
+            leg=int(self.leg[pose]),
+            distance=float(self.distance[pose]),
+            axis=self.axis[pose],
+            rotation=self.rotation[pose],
         )
 
     def __iter__(self) -> Iterator[NearestSingularity]:
@@ -107,16 +109,13 @@ class NearestSingularities(Explained):
         return (self[pose] for pose in range(len(self)))
 
     def _facts(self) -> dict[str, object]:
-        distances = self.distance
+        least = float(np.min(self.distance, initial=np.inf))
+        largest = float(np.max(self.distance, initial=0.0))
         return {
             "poses": len(self),
             "nearest one is parallel": int(np.count_nonzero(self.leg < 0)),
-            "least turn of the star to one [rad]": float(
-                np.min(distances, initial=np.inf)
-            ),
-            "largest turn of the star to one [rad]": float(
-                np.max(distances, initial=0.0)
-            ),
+            "least turn of the star to one [rad]": least,
+            "largest turn of the star to one [rad]": largest,
         }
 
 
@@ -188,7 +187,8 @@ def _find_nearest(geometry: Geometry, rotations: Array) -> NearestSingularities:
     )
     for pose, turn in zip(owner[is_singular], parallel[is_singular], strict=True):
         if turn @ turn < v[pose] @ v[pose]:
-            leg[pose], v[pose] = -1, turn
+            leg[pose] = -1
+            v[pose] = turn
     length = np.sqrt(dot(v, v))
     is_turned = (length > 0.0)[:, None]
     axis = np.where(is_turned, v, (0.0, 0.0, 1.0))
@@ -225,9 +225,9 @@ def _first_changes(geometry: Geometry, axes: Array, nearest: Array) -> _Changes:
     """Return the nearest changes of sign along rays that end at the turns `nearest`."""
     rays = _even_directions(RAYS)
     angles = 2.0 * np.arctan(np.sqrt(dot(nearest, nearest)))
-    shares = np.linspace(0.0, 1.0 - 1e-9, RAY_POINTS)
+    shares = np.linspace(0.0, SHORT_OF_SERIAL, RAY_POINTS)
     tau = np.tan(0.5 * angles[:, None] * shares)
-    powers = tau[:, None, :] ** np.arange(7)[:, None]
+    powers = tau[:, None, :] ** np.arange(DEGREE + 1)[:, None]
     polynomials = _det_along(geometry.e, axes, rays)
     values = polynomials @ powers
     is_beyond = values * polynomials[:, :1, :1] <= 0.0
@@ -260,11 +260,12 @@ def _det_along(e: Array, axes: Array, rays: Array) -> Array:
     quadratic = 2.0 * dot(ray, w)[..., None] * ray - w
     rows = [_across(e, coefficient) for coefficient in (constant, linear, quadratic)]
     count = len(axes), len(rays)
-    normals = np.zeros((5, *count, 3))  # of the second and third leg, by degree
+    # cross products of the second and the third leg's rows, by degree from 0 to 4
+    normals = np.zeros((5, *count, 3))
     for i, second in enumerate(rows):
         for j, third in enumerate(rows):
             normals[i + j] += cross(second[:, :, 1], third[:, :, 2])
-    polynomials = np.zeros((*count, 7))
+    polynomials = np.zeros((*count, DEGREE + 1))
     for i, first in enumerate(rows):
         for degree, normal in enumerate(normals):
             polynomials[:, :, i + degree] += dot(first[:, :, 0], normal)
@@ -289,7 +290,8 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
     count = len(v)
     turn = v[:, None]
     unit = np.eye(3)
-    square, along = dot(v, v), dot(turn, axes)
+    square = dot(v, v)
+    along = dot(turn, axes)
     turned = (1.0 - square)[:, None, None] * axes - 2.0 * cross(turn, axes)
     rows = _across(e, turned + 2.0 * along[..., None] * turn)
     slopes = []
@@ -339,9 +341,8 @@ def _least_turns(
             curvature, gradient, v[active], scale * determinant.value, is_slope
         )
         length = np.sqrt(dot(step, step))
-        v[active] += (
-            step * np.minimum(1.0, LONGEST_STEP / np.maximum(length, FLAT))[:, None]
-        )
+        share = np.minimum(1.0, LONGEST_STEP / np.maximum(length, FLAT))
+        v[active] += step * share[:, None]
         is_last = (length <= LAST_STEP) | ~is_slope
         is_singular[active[is_last & is_slope]] = True
         active = active[~is_last]
@@ -367,14 +368,17 @@ def _constrained_step(
     tangent = np.eye(3) - normal
     inside = tangent @ (np.eye(3) + curvature) @ tangent + normal
     is_least = np.linalg.eigvalsh(inside).min(axis=1) > 0.0
+    # Unknown are the three components of the step, then the multiplier.
+    step = slice(0, 3)
+    multiplier = -1
     matrix = np.zeros((len(v), 4, 4))
-    matrix[:, :3, :3] = np.eye(3)
-    matrix[:, :3, :3] += np.where(is_least[:, None, None], curvature, 0.0)
-    matrix[:, 3, :3] = gradient
-    matrix[:, :3, 3] = gradient
-    matrix[~is_slope, 3, 3] = 1.0
+    matrix[:, step, step] = np.eye(3)
+    matrix[:, step, step] += np.where(is_least[:, None, None], curvature, 0.0)
+    matrix[:, multiplier, step] = gradient
+    matrix[:, step, multiplier] = gradient
+    matrix[~is_slope, multiplier, multiplier] = 1.0
     right = np.concatenate([-v, -value[:, None]], axis=1)
-    return np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, :3, 0])
+    return np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, step, 0])
 
 
 def _even_directions(count: int) -> Array:

@@ -175,7 +175,7 @@ def _motion(
 class OrientationSensitivity(NamedTuple):
     """Derivatives of the orientation, as rotation vectors in {E} [rad].
 
-    Their components come first.
+    The first axis behind the poses has the components of the rotation vector.
     """
 
     gamma: Array  #: by the actuator angles, shape (..., 3, 3)
@@ -210,7 +210,8 @@ def orientation_sensitivity(
     if gamma is None:
         gamma, _, _ = kinematics.inverse(geometry, matrix)
     angles = np.asarray(gamma, dtype=float)
-    v, w = geometry.v, geometry.w
+    v = geometry.v
+    w = geometry.w
     r = kinematics.carriage_directions(geometry, angles)
     t = kinematics.star_axes(geometry, matrix)
     shape = angles.shape[:-1]
@@ -219,9 +220,9 @@ def orientation_sensitivity(
     by_alpha = np.zeros((*shape, 3, 3))
     alpha_12, alpha_23, _ = geometry.alpha
     turns = np.cumsum([0.0, alpha_12, alpha_23])
-    for k in range(3):
-        following = (k + 1) % 3
-        r_k, t_k = r[..., k, :], t[..., k, :]
+    for k, following in ((0, 1), (1, 2), (2, 0)):
+        r_k = r[..., k, :]
+        t_k = t[..., k, :]
         sine = np.sin(angles[..., k, None])
         cosine = np.cos(angles[..., k, None])
         by_gamma[..., k, k] = _dot(np.cross(w[k], r_k), t_k)

@@ -13,7 +13,7 @@ when some alpha_k > 180 deg; none for all alpha_k < 180 deg and beta_k < 90 deg.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 
 import numpy as np
@@ -153,7 +153,8 @@ def _condition(normal: Array, c: Array) -> Array:
     ]
     matrix = np.nan_to_num(np.stack(rows, axis=-2))
     singular = np.linalg.svd(matrix, compute_uv=False)
-    largest, smallest = singular[..., 0], singular[..., -1]
+    largest = singular[..., 0]
+    smallest = singular[..., -1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(smallest > 0.0, largest / smallest, np.inf))
 
@@ -197,8 +198,11 @@ def over_orientations(
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         measured.append(measures(geometry, gamma, rotation))
-    by_name = zip(*(vars(part).values() for part in measured), strict=True)
-    joined = Measures(*map(np.concatenate, by_name))
+    arrays = {}
+    for field in fields(Measures):
+        blocks = [getattr(block_measures, field.name) for block_measures in measured]
+        arrays[field.name] = np.concatenate(blocks)
+    joined = Measures(**arrays)
     frozen(directions, psi, *vars(joined).values())
     return OrientationMap(geometry, directions, psi, joined)
 
@@ -209,7 +213,7 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
     theta and phi are those of s; where s = +-z, theta is 0. R has the shape (..., 3,
     3).
     """
-    s_x, s_y, s_z = s[..., 0], s[..., 1], s[..., 2]
+    s_x, s_y, s_z = np.moveaxis(s, -1, 0)
     sine_phi = np.hypot(s_x, s_y)
     at_pole = sine_phi == 0.0
     divisor = np.where(at_pole, 1.0, sine_phi)
@@ -226,20 +230,27 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
 def triangle_directions(
     geometry: Geometry, divisions: int = 40
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Directions inside the base triangle, (m, 3), and their triangles, (n, 3)."""
+    """Return directions inside the base triangle, (m, 3), and their triangles, (n, 3).
+
+    The directions are the nodes (i, j) of a triangular grid, i steps from one corner
+    and j from another; each triangle has the numbers of its three nodes.
+    """
     steps = range(divisions + 1)
     i, j = np.nonzero(np.add.outer(steps, steps) <= divisions)
-    number = np.full((divisions + 2, divisions + 2), -1)  # -1 for none
+    no_node = -1
+    number = np.full((divisions + 2, divisions + 2), no_node)
     number[i, j] = np.arange(len(i))
-    corner, right, above = number[i, j], number[i + 1, j], number[i, j + 1]
-    below = np.where(j > 0, number[i + 1, j - 1], -1)
-    upward = corner, right, above
-    downward = corner, below, right
+    corner = number[i, j]
+    right = number[i + 1, j]
+    above = number[i, j + 1]
+    below = np.where(j > 0, number[i + 1, j - 1], no_node)
+    upward = (corner, right, above)
+    downward = (corner, below, right)
     faces = np.stack([upward, downward], axis=-1).reshape(3, -1).T
     # 0.1 of a step more for each corner keeps all directions off the edges.
     weights = np.column_stack([i, j, divisions - i - j]) + 0.1
     s = weights @ geometry.v
-    inside = np.asarray(faces[faces.min(axis=1) >= 0], dtype=np.intp)
+    inside = np.asarray(faces[faces.min(axis=1) > no_node], dtype=np.intp)
     return s / np.linalg.norm(s, axis=1)[:, None], inside
 
 
@@ -254,7 +265,7 @@ class SingularPoses:
     beta: Array
     #: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
     leg: Array
-    determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
+    determinant: Array  #: det J2 or c_k there, shape (m,): 0 up to rounding
 
     def __len__(self) -> int:
         return len(self.rotation)
@@ -341,7 +352,8 @@ def _report_poses(poses: SingularPoses, place: str) -> str:
         return f"{poses.kind}: none {place}"
     row = len(poses) // 2
     gamma = ", ".join(f"{x:.4f}" for x in np.degrees(poses.gamma[row]))
-    s = ", ".join(f"{x:.4f}" for x in poses.rotation[row, :, 2])
+    _, _, s_axis = poses.rotation[row].T
+    s = ", ".join(f"{x:.4f}" for x in s_axis)
     text = f"{len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg"
     if poses.kind == "serial":
         text += f", leg {poses.leg[row] + 1}"
