@@ -56,11 +56,12 @@ class Problem:
 
     def _value_text(self) -> str:
         """Return the value as text, shortened in the middle."""
-        text = f"{type(self.value).__name__} without a text"
-        if isinstance(self.value, int) and self.value:  # of 5,000 digits has no text
-            text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
-        with contextlib.suppress(Exception):
+        try:
             text = repr(self.value)
+        except Exception:  # of an object of the user
+            text = f"{type(self.value).__name__} without a text"
+            if isinstance(self.value, int) and self.value:  # of 5,000 digits has none
+                text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
         is_path = isinstance(self.value, str) and os.sep in text
         longest = LONGEST_PATH if is_path else SHOWN_CHARACTERS
         if len(text) <= longest:
@@ -114,7 +115,7 @@ def refuse_other_rounding(origin: str) -> None:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of argument: whether a value is of it, and the words of a refusal."""
+    """A kind of argument: what accepts a value, and the words of a refusal."""
 
     accepts: Callable[[Any], Any]
     requirement: str
@@ -226,7 +227,7 @@ _FAILURES = (
     ArithmeticError,
     MemoryError,
 )
-"""Of a function that was given something else."""
+"""Errors of a function that was given an argument of another kind."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -238,7 +239,9 @@ def check_kinds(function: F, *, late: bool = False) -> F:
     What else an argument must be is checked by the function itself.
     """
     names = list(inspect.signature(function).parameters)
-    origin = function.__qualname__.removesuffix(".__init__").rpartition(".")[2].lower()
+    qualified_name = function.__qualname__.removesuffix(".__init__")
+    _, _, last_name = qualified_name.rpartition(".")  # of the function, or of its class
+    origin = last_name.lower()
 
     @functools.cache
     def kinds() -> dict[str, tuple[Kind | None, bool]]:

@@ -25,7 +25,7 @@ from sst_ros.code_generation.named_programs import SceneEquations
 from sst_ros.errors import SstError
 from sst_ros.files import load_templates
 from sst_ros.integration.methods import DOP853
-from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.version import VERSION
 
 STATES = (
@@ -33,10 +33,8 @@ STATES = (
     *(f"body_rate_{axis}" for axis in "xyz"),
     *(f"actuator_torque_{leg}" for leg in (1, 2, 3)),
 )
-INPUTS = (
-    *(f"torque_{leg}" for leg in (1, 2, 3)),
-    *(f"moment_{axis}" for axis in "xyz"),
-)
+TORQUE_INPUTS = tuple(f"torque_{leg}" for leg in (1, 2, 3))
+MOMENT_INPUTS = MOMENTS
 FMU_OUTPUTS = (
     *JOINTS,
     *(f"{name}_rate" for name in JOINTS),
@@ -71,12 +69,10 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
         equations.scene, equations.parameters, ("derivative", "joints", "energies")
     )
     templates = load_templates("code_generation")
-    token = str(
-        uuid.uuid5(
-            uuid.NAMESPACE_URL,
-            f"{VERSION} {model.scene_hash} {model.parameters}",
-        )
-    )
+    contents = f"{VERSION} {model.scene_hash} {model.parameters}"
+    token = str(uuid.uuid5(uuid.NAMESPACE_URL, contents))
+    stages = len(DOP853.c)
+    stage_rows = [[*row, *[0.0] * (stages - len(row))] for row in DOP853.a]
     sources = c_files(model)
     sources["fmi3.c"] = templates.get_template("fmi3.c").render(
         name=name,
@@ -85,8 +81,8 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
         inputs=sum(argument.size for argument in model.acting),
         parameters=model.parameters,
         torque_limit=model.scene.torque_limit,
-        stages=len(DOP853.c),
-        stage_rows=[[*row, *(0.0,) * (len(DOP853.c) - len(row))] for row in DOP853.a],
+        stages=stages,
+        stage_rows=stage_rows,
         weights=DOP853.b,
         fifth=DOP853.error,
         third=DOP853.damping,
@@ -120,10 +116,8 @@ def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:
     """Yield the attributes of each variable, in the order of value references."""
     continuous = {"variability": "continuous"}
     size = equations.state.size
-    rows: list[dict[str, Any]] = [
-        {"name": "time", "causality": "independent", "unit": "s"}
-    ]
-    rows[0] |= continuous
+    time = {"name": "time", "causality": "independent", "unit": "s"}
+    rows: list[dict[str, Any]] = [time | continuous]
     for name, unit, start in zip(STATES, STATE_UNITS, equations.initial, strict=False):
         exact = {"initial": "exact", "start": repr(start)}
         rows.append(
@@ -136,9 +130,8 @@ def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:
             | continuous
             | derivative
         )
-    for argument, names in zip(
-        equations.acting, (INPUTS[:3], INPUTS[3:]), strict=False
-    ):
+    inputs = (TORQUE_INPUTS, MOMENT_INPUTS)  # there is a moment if a topic gives it
+    for argument, names in zip(equations.acting, inputs, strict=False):
         for name, quantity in zip(names, argument.quantities, strict=True):
             about = {"causality": "input", "unit": "N.m", "description": quantity}
             rows.append({"name": name, "start": "0.0"} | about | continuous)

@@ -22,7 +22,13 @@ import numpy as np
 from sst_ros.errors import check_kinds, refusal, refuse_unless
 from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import Scalar
-from sst_ros.programs.expression import Expression, Program, trace
+from sst_ros.programs.expression import (
+    Expression,
+    Program,
+    constant_text,
+    references,
+    trace,
+)
 from sst_ros.scene.own_loads import (
     BODY_RATE,
     OMEGA,
@@ -458,9 +464,8 @@ def write_formulas(
     first = len(program.inputs)  # number of the first step
     uses = [0] * (first + len(program.steps))
     for _, operands in program.steps:
-        for operand in operands:
-            if isinstance(operand, int):
-                uses[operand] += 1
+        for number in references(operands):
+            uses[number] += 1
     prefix = "s"
     while any(name.startswith(prefix) for name in program.inputs):
         prefix += "_"
@@ -470,7 +475,7 @@ def write_formulas(
     def operand_text(operand: float | int) -> str:
         if isinstance(operand, int):
             return value_texts[operand]
-        return repr(operand) if operand >= 0.0 else f"({operand!r})"
+        return constant_text(operand)
 
     for index, (operation, operands) in enumerate(program.steps, start=first):
         assert isinstance(operation, str)  # no routine: a load has none

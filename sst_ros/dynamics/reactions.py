@@ -42,6 +42,7 @@ from sst_ros.dynamics.traced_dynamics import (
     TORQUE_SYMBOLS,
     Dynamics,
     Function,
+    parameter_symbols,
 )
 from sst_ros.errors import require
 from sst_ros.mechanism.generic_math import (
@@ -308,7 +309,7 @@ class ScenarioReactions:
             place: x for place, x in numbers.items() if isinstance(x, np.ndarray)
         }
         self._columns = list(columns.values())
-        names = (*MOTION, *TORQUE_SYMBOLS, *(f"p{i}" for i in range(len(columns))))
+        names = (*MOTION, *TORQUE_SYMBOLS, *parameter_symbols(len(columns)))
 
         def run(*inputs: Any) -> list[Any]:
             sizes = {"state": STATE_SIZE, "torque": LEGS, "columns": len(columns)}

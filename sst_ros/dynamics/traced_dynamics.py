@@ -58,6 +58,12 @@ QUATERNION_ROWS = slice(0, len(QUATERNION_SYMBOLS))
 RATE_ROWS = slice(len(QUATERNION_SYMBOLS), STATE_SIZE)
 MOTION_ROWS = slice(0, STATE_SIZE)
 
+
+def parameter_symbols(count: int) -> tuple[str, ...]:
+    """Return symbols of numbers that are inputs of a program."""
+    return tuple(f"p{i}" for i in range(count))
+
+
 DYNAMICS_OUTPUTS = (*Joints._fields, "energy")
 """Quantities of a state that depend on the numbers of its scenario."""
 
@@ -295,7 +301,7 @@ class ODE:
         slopes: Array = np.array(by_state)
         if not np.isfinite(slopes).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return slopes.T
+        return np.asarray(slopes.T)
 
     @cached_property
     def slope(self) -> Function:
@@ -437,7 +443,7 @@ class ParametricModel:
                 self._varied.append(place)
             else:
                 self._fixed[place] = float(np.ravel(number)[0])
-        self.names = tuple(f"p{i}" for i in range(len(self._varied)))
+        self.names = parameter_symbols(len(self._varied))
         self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -36,6 +36,7 @@ from sst_ros.dynamics.traced_dynamics import (
     STATE_SIZE,
     TORQUE_SYMBOLS,
     Dynamics,
+    parameter_symbols,
 )
 from sst_ros.errors import SingularConfiguration, refusal
 from sst_ros.mechanism.generic_math import (
@@ -430,7 +431,7 @@ def trace_derivatives(
 ) -> Callable[..., list[float]]:
     """Return y', then its derivatives by y, by torques if needed, and by parameters."""
     state = Dynamics.of(scene).state
-    varied = tuple(f"p{i}" for i in range(len(names)))
+    varied = parameter_symbols(len(names))
     sizes = {"state": len(state), "torque": LEGS, "parameters": len(names)}
 
     def derivative(*inputs: Any) -> tuple[Any, ...]:
@@ -453,7 +454,7 @@ def _trace_joints(
     scene: Scene, names: tuple[str, ...]
 ) -> Callable[..., tuple[Any, ...]]:
     """Return gamma, gamma_dot and derivatives by quaternion, W and named numbers."""
-    inputs = (*MOTION, *(f"p{i}" for i in range(len(names))))
+    inputs = (*MOTION, *parameter_symbols(len(names)))
 
     def angles_and_rates(*values: Any) -> tuple[Any, ...]:
         motion, numbers = values[:STATE_SIZE], values[STATE_SIZE:]

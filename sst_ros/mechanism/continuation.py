@@ -72,7 +72,8 @@ def follow(
 
     """
     points = np.array(gamma, dtype=float)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
+    is_table = points.ndim == 2 and points.shape[1] == 3
+    if not is_table or not np.all(np.isfinite(points)):
         raise AssemblyError("gamma must be rows of three finite numbers", points)
     if rotation is None:
         rotation = kinematics.admissible(geometry, points[0]).rotation
@@ -134,7 +135,8 @@ def advance(
 
 def _least_singular(matrices: Array) -> Array:
     """Return the least singular values of matrices (..., 3, 3)."""
-    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[..., -1], dtype=float)
+    descending = np.linalg.svd(matrices, compute_uv=False)
+    return np.asarray(descending[..., -1], dtype=float)
 
 
 def _slope(geometry: Geometry, gamma: Array, rotation: Array) -> Array:

@@ -28,6 +28,8 @@ KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 SMALL = 1000  # numbers of an array below which `take` is faster than slices
 NEXT = np.array([1, 2, 0])  # components after x, y, z
 LAST = np.array([2, 0, 1])  # components before them
+CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+"""Legs, or axes, each with the two that follow it."""
 
 
 def frozen(*arrays: Any) -> tuple[Any, ...]:
@@ -107,8 +109,8 @@ class Geometry(Explained):
         alpha_12 = angles[..., 0]
         alpha_23 = angles[..., 1]
         zero = np.zeros_like(alpha_12)
-        turns = np.stack([zero, alpha_12, alpha_12 + alpha_23], axis=-1)
-        e = np.stack([-np.sin(turns), np.cos(turns), np.zeros_like(turns)], axis=-1)
+        turns = vectors(zero, alpha_12, alpha_12 + alpha_23)
+        e = vectors(-np.sin(turns), np.cos(turns), np.zeros_like(turns))
         w = normals / sines[..., None]
         arcs = np.arctan2(sines, cosines)
         largest: Any = beta_max if beta_shape else float(np.asarray(beta_max))
@@ -117,7 +119,7 @@ class Geometry(Explained):
 
     @classmethod
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
-        """Derive the distinct geometries of `Scenarios`, and the index of each row's."""
+        """Derive the distinct geometries of `Scenarios`, and which each row has."""
         scene = scenarios.document
         columns_by_key = [scenarios.rows.get(key) for key in KEYS]
         varied = []
@@ -143,7 +145,7 @@ class Geometry(Explained):
         return distinct, geometry_of_row.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
-        """Return the geometries of rows, or of a row; a single geometry is that of all."""
+        """Return the geometries of rows, or of a row; a single one is that of all."""
         if self.v.ndim == 2:
             return self
         return Geometry(*(array[rows] for array in vars(self).values()))
@@ -177,12 +179,12 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     yy = y * y
     zz = z * z
     ww = w * w
-    rows = (
-        (xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
-        (2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
-        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -xx - yy + zz + ww),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    rows = [
+        vectors(xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        vectors(2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
+        vectors(2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -xx - yy + zz + ww),
+    ]
+    return np.stack(rows, axis=-2)
 
 
 def quaternion_of(rotation: ArrayLike) -> Array:
@@ -198,7 +200,7 @@ def quaternion_of(rotation: ArrayLike) -> Array:
     # Row n is four times component n times the whole quaternion.
     *stack_shape, _, _ = m.shape
     products = np.empty((*stack_shape, 4, 4))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    for i, j, k in CYCLIC:
         products[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
         products[..., i, j] = m[..., j, i] + m[..., i, j]
         products[..., i, k] = m[..., k, i] + m[..., i, k]
@@ -208,7 +210,8 @@ def quaternion_of(rotation: ArrayLike) -> Array:
     diagonal = np.diagonal(m, axis1=-2, axis2=-1)
     sizes = np.concatenate([diagonal, trace[..., None]], axis=-1)
     largest = np.argmax(sizes, axis=-1)
-    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    row = np.take_along_axis(products, largest[..., None, None], axis=-2)
+    q = np.squeeze(row, axis=-2)
     q = q / np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
     signs = np.sign(np.roll(q, 1, axis=-1))  # w first
     first = np.argmax(signs != 0.0, axis=-1)
@@ -224,15 +227,16 @@ def zyz_angles(rotation: ArrayLike) -> Array:
     theta is 0 and psi carries it all.
     """
     r = np.asarray(rotation, dtype=float)
-    sine = np.hypot(r[..., 0, 2], r[..., 1, 2])
+    s_x, s_y, s_z = np.moveaxis(r[..., :, 2], -1, 0)
+    sine = np.hypot(s_x, s_y)
     pole = sine == 0.0
-    theta = np.where(pole, 0.0, np.arctan2(r[..., 1, 2], r[..., 0, 2]))
+    theta = np.where(pole, 0.0, np.arctan2(s_y, s_x))
     psi = np.where(
         pole,
         np.arctan2(r[..., 1, 0], r[..., 1, 1]),
         np.arctan2(r[..., 2, 1], -r[..., 2, 0]),
     )
-    return np.stack([theta, np.arctan2(sine, r[..., 2, 2]), psi], axis=-1)
+    return vectors(theta, np.arctan2(sine, s_z), psi)
 
 
 def unwrap_zyz(angles: ArrayLike) -> Array:
@@ -268,8 +272,10 @@ def _nearest_form(angles: Array, reference: Array) -> Array:
         # Kept is theta + psi at phi = 0, theta - psi at phi = pi.
         psi = psi - shift if phi == 0.0 else psi + shift
     forms = np.array([[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]])
-    forms += 2.0 * np.pi * np.round((reference - forms) / (2.0 * np.pi))
-    return np.asarray(forms[np.argmin(np.abs(forms - reference).sum(axis=1))])
+    full_turn = 2.0 * np.pi
+    forms += full_turn * np.round((reference - forms) / full_turn)
+    distances = np.abs(forms - reference).sum(axis=1)
+    return np.asarray(forms[np.argmin(distances)])
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
@@ -300,8 +306,20 @@ def cross(a: Array, b: Array) -> Array:
 def dot(a: Array, b: Array) -> Array:
     """Scalar product along the last axis, of three; much faster than np.sum."""
     product = a * b
-    x, y, z = product[..., 0], product[..., 1], product[..., 2]
+    x = product[..., 0]
+    y = product[..., 1]
+    z = product[..., 2]
     return np.asarray(x + y + z)
+
+
+def norm(a: Array) -> Array:
+    """Length along the last axis, of three."""
+    return np.asarray(np.sqrt(dot(a, a)))
+
+
+def vectors(x: Array, y: Array, z: Array) -> Array:
+    """Vectors (..., 3) with the given components."""
+    return np.stack([x, y, z], axis=-1)
 
 
 def columns(a: Array, b: Array, c: Array) -> Array:

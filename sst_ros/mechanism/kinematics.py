@@ -41,6 +41,7 @@ from sst_ros.mechanism.geometry import (
     cross,
     dot,
     frozen,
+    norm,
     quaternion_of,
 )
 from sst_ros.state import Assembly
@@ -134,7 +135,7 @@ def inverse(
     t = star_axes(geometry, matrices)
     s = matrices[..., None, :, 2]
     p = cross(t, geometry.w)
-    sine = np.sqrt(dot(p, p))
+    sine = norm(p)
     sign = np.asarray(signs, dtype=float)
     p = sign[:, None] * p
     across = cross(geometry.w, geometry.v)
@@ -175,7 +176,8 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     numbers.
     """
     angles = np.asarray(gamma, dtype=float)
-    if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):
+    is_table = angles.ndim == 2 and angles.shape[1] == 3
+    if not is_table or not np.all(np.isfinite(angles)):
         raise AssemblyError(
             "gamma must be three finite numbers, or rows of them", angles
         )
@@ -281,7 +283,8 @@ def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
     """
     r_1 = r[:, 0]
     directions = r[:, 1:]  # r_2 and r_3
-    n = cross(r_1, np.eye(3)[np.argmin(np.abs(r_1), axis=1)])
+    least_axis = np.eye(3)[np.argmin(np.abs(r_1), axis=1)]  # far from r_1
+    n = cross(r_1, least_axis)
     n /= np.linalg.norm(n, axis=1)[:, None]
     m = cross(r_1, n)
     along_n = (directions @ n[:, :, None])[..., 0]
@@ -344,9 +347,10 @@ def _quartic(a: Array, b: Array, c: Array) -> Array:
 
 def _product(a: Array, b: Array) -> Array:
     """Products of forms, coefficients along the last axis."""
-    result = np.zeros((len(a), a.shape[1] + b.shape[1] - 1))
-    for power in range(a.shape[1]):
-        result[:, power : power + b.shape[1]] += a[:, power, None] * b
+    size = b.shape[1]
+    result = np.zeros((len(a), a.shape[1] + size - 1))
+    for power, coefficient in enumerate(a.T):
+        result[:, power : power + size] += coefficient[:, None] * b
     return result
 
 
@@ -386,7 +390,8 @@ def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
     z = np.linalg.eigvals(companion)
     square = z.real**2 + z.imag**2
     # z = cot(x - x_0)
-    x = TURN_ANGLES[best][:, None] + 0.5 * np.arctan2(2.0 * z.real, square - 1.0)
+    from_best = 0.5 * np.arctan2(2.0 * z.real, square - 1.0)
+    x = TURN_ANGLES[best][:, None] + from_best
     is_near_real = np.abs(z.imag) < NEAR_REAL * (1.0 + square)
     return x, isolated[:, None] & is_near_real
 
@@ -442,7 +447,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
             t = t[moves]
             residual = residual[moves]
         step = _newton_step(cross(t, r), residual)
-        length = np.sqrt(dot(step, step))
+        length = norm(step)
         if length.max() > LONGEST_TURN:
             share = LONGEST_TURN / np.maximum(length, SMALLEST)
             step = step * np.minimum(1.0, share)[:, None]
@@ -473,9 +478,9 @@ def rotate(rotation: Array, step: Array) -> Array:
     """
     t = _turn_vector(rotation[..., 1], step)
     s = _turn_vector(rotation[..., 2], step)
-    s = s / np.sqrt(dot(s, s))[..., None]
+    s = s / norm(s)[..., None]
     t = t - s * dot(s, t)[..., None]
-    t = t / np.sqrt(dot(t, t))[..., None]
+    t = t / norm(t)[..., None]
     return columns(cross(t, s), t, s)
 
 
@@ -497,7 +502,8 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
             continue
         new = rotation[later]
         old = rotation[later - back]
-        sign = np.where(dot(new[:, :, 1], old[:, :, 1]) < 0.0, -1.0, 1.0)
+        along = dot(new[:, :, 1], old[:, :, 1])  # of the vectors t_1
+        sign = np.where(along < 0.0, -1.0, 1.0)
         partner = np.stack([sign, sign, np.ones_like(sign)], axis=1)
         old = old * partner[:, None, :]
         close = np.abs(new - old).max(axis=(1, 2)) < SAME_ROOT
@@ -520,7 +526,8 @@ def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
     # t_1 first, then -t_1: first the one further along the first base vector where they
     # differ.
     t_1 = np.round(rotation[:, :, 1], SORTED_DIGITS)
-    first_entry = t_1[np.arange(len(t_1)), np.argmax(t_1 != 0.0, axis=1)]
+    component = np.argmax(t_1 != 0.0, axis=1)
+    first_entry = t_1[np.arange(len(t_1)), component]
     is_behind = (first_entry < 0.0)[:, None, None]
     leading = np.where(is_behind, partner, rotation)
     pairs = np.stack([leading, leading * HALF_TURN], axis=1)

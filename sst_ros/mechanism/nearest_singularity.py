@@ -31,12 +31,15 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import check_kinds, read_numbers, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import (
+    CYCLIC,
     Array,
     Geometry,
     cross,
     dot,
     frozen,
+    norm,
     rotation_matrix,
+    vectors,
 )
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import Explained
@@ -189,7 +192,7 @@ def _find_nearest(geometry: Geometry, rotations: Array) -> NearestSingularities:
         if turn @ turn < v[pose] @ v[pose]:
             leg[pose] = -1
             v[pose] = turn
-    length = np.sqrt(dot(v, v))
+    length = norm(v)
     is_turned = (length > 0.0)[:, None]
     axis = np.where(is_turned, v, (0.0, 0.0, 1.0))
     axis = axis / np.where(is_turned, length[:, None], 1.0)
@@ -204,11 +207,12 @@ def _turns_to_serial(geometry: Geometry, axes: Array) -> tuple[NDArray[np.intp],
     """Return the leg, and v of the least turn, that bring t_k onto +-w_k."""
     normals = cross(geometry.e, axes)
     cosines = dot(geometry.e, axes)
-    sines = np.sqrt(dot(normals, normals))
+    sines = norm(normals)
     angles = np.arctan2(sines, np.abs(cosines))
     leg = angles.argmin(axis=1)
     pose = np.arange(len(axes))
-    normal = np.copysign(1.0, cosines[pose, leg])[:, None] * normals[pose, leg]
+    sign = np.copysign(1.0, cosines[pose, leg])  # the nearer end of the line of w_k
+    normal = sign[:, None] * normals[pose, leg]
     sine = sines[pose, leg][:, None]
     direction = normal / np.where(sine > 0.0, sine, 1.0)
     return leg, np.tan(0.5 * angles[pose, leg])[:, None] * direction
@@ -224,14 +228,15 @@ class _Changes(NamedTuple):
 def _first_changes(geometry: Geometry, axes: Array, nearest: Array) -> _Changes:
     """Return the nearest changes of sign along rays that end at the turns `nearest`."""
     rays = _even_directions(RAYS)
-    angles = 2.0 * np.arctan(np.sqrt(dot(nearest, nearest)))
+    angles = 2.0 * np.arctan(norm(nearest))
     shares = np.linspace(0.0, SHORT_OF_SERIAL, RAY_POINTS)
     tau = np.tan(0.5 * angles[:, None] * shares)
     powers = tau[:, None, :] ** np.arange(DEGREE + 1)[:, None]
     polynomials = _det_along(geometry.e, axes, rays)
     values = polynomials @ powers
     is_beyond = values * polynomials[:, :1, :1] <= 0.0
-    first = np.where(is_beyond.any(axis=2), is_beyond.argmax(axis=2), RAY_POINTS)
+    changes = is_beyond.any(axis=2)
+    first = np.where(changes, is_beyond.argmax(axis=2), RAY_POINTS)
     nearest_rays = np.argsort(first, axis=1, kind="stable")[:, :REFINED]
     pose, place = np.nonzero(
         np.take_along_axis(first, nearest_rays, axis=1) < RAY_POINTS
@@ -302,7 +307,7 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
     normals = np.empty(axes.shape)
     gradient = np.zeros((count, 3))
     hessian = np.zeros((count, 3, 3))
-    for k, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    for k, following, last in CYCLIC:
         normals[:, k] = cross(rows[:, following], rows[:, last])
         for i, j in np.ndindex(3, 3):
             first, second = slopes[i][:, following], slopes[j][:, last]
@@ -330,17 +335,17 @@ def _least_turns(
     for _ in range(NEWTON_STEPS):
         if not len(active):
             break
+        turn = v[active]
         scale = 1.0 / sizes[active]
-        determinant = _determinant(e, axes[active], v[active])
+        determinant = _determinant(e, axes[active], turn)
         gradient = scale[:, None] * determinant.gradient
         square = dot(gradient, gradient)
         is_slope = square > FLAT
-        multiplier = -dot(gradient, v[active]) / np.where(is_slope, square, 1.0)
+        multiplier = -dot(gradient, turn) / np.where(is_slope, square, 1.0)
         curvature = (multiplier * scale)[:, None, None] * determinant.hessian
-        step = _constrained_step(
-            curvature, gradient, v[active], scale * determinant.value, is_slope
-        )
-        length = np.sqrt(dot(step, step))
+        value = scale * determinant.value
+        step = _constrained_step(curvature, gradient, turn, value, is_slope)
+        length = norm(step)
         share = np.minimum(1.0, LONGEST_STEP / np.maximum(length, FLAT))
         v[active] += step * share[:, None]
         is_last = (length <= LAST_STEP) | ~is_slope
@@ -378,7 +383,8 @@ def _constrained_step(
     matrix[:, step, multiplier] = gradient
     matrix[~is_slope, multiplier, multiplier] = 1.0
     right = np.concatenate([-v, -value[:, None]], axis=1)
-    return np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, step, 0])
+    unknowns = np.linalg.solve(matrix, right[:, :, None])[..., 0]
+    return np.asarray(unknowns[:, step])
 
 
 def _even_directions(count: int) -> Array:
@@ -387,4 +393,4 @@ def _even_directions(count: int) -> Array:
     z = 1.0 - (2.0 * number + 1.0) / count
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number
     radius = np.sqrt(1.0 - z * z)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    return vectors(radius * np.cos(angle), radius * np.sin(angle), z)

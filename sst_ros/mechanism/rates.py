@@ -24,7 +24,14 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
+from sst_ros.mechanism.geometry import (
+    CYCLIC,
+    Array,
+    Geometry,
+    cross,
+    frozen,
+    rotation_matrix,
+)
 from sst_ros.mechanism.virtual_work import SINGULAR_MATRIX, Posture
 from sst_ros.state import ZERO
 
@@ -147,8 +154,9 @@ def _motion(
     zero = np.zeros(3)
     x = np.array([1.0, 0.0, 0.0])
     # w in {2k} = [r, t x r, t]: it has no component along r.
-    w_ipl = [zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)]
-    turn = np.stack(w_ipl, axis=1)
+    w_across = np.sum(w * cross(t, r), axis=1)
+    w_along = np.sum(w * t, axis=1)
+    turn = np.stack([zero, w_across, w_along], axis=1)
     # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
     across = cross(turn, np.broadcast_to(x, turn.shape))
     of_gamma = gamma_ddot[:, None] * turn
@@ -220,16 +228,16 @@ def orientation_sensitivity(
     by_alpha = np.zeros((*shape, 3, 3))
     alpha_12, alpha_23, _ = geometry.alpha
     turns = np.cumsum([0.0, alpha_12, alpha_23])
-    for k, following in ((0, 1), (1, 2), (2, 0)):
+    for k, following, _ in CYCLIC:
         r_k = r[..., k, :]
         t_k = t[..., k, :]
         sine = np.sin(angles[..., k, None])
         cosine = np.cos(angles[..., k, None])
         by_gamma[..., k, k] = _dot(np.cross(w[k], r_k), t_k)
         for leg in (k, following):
-            for axis in range(3):
+            for axis, direction in enumerate(np.eye(3)):
                 # v stays a unit vector: its change is across itself.
-                moved_v = np.eye(3)[axis] - v[leg] * v[leg][axis]
+                moved_v = direction - v[leg] * v[leg][axis]
                 if leg == k:
                     moved_v_k = moved_v
                     moved_normal = cross(moved_v, v[following])

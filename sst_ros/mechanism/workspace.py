@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
+from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen, vectors
 from sst_ros.progress import slices
 from sst_ros.state import Explained
 
@@ -95,7 +95,8 @@ class OrientationMap:
             crossing = np.where(outer < 0.0, inner / (inner - outer), 0.5)
         share = np.where(first | second, crossing, 0.0)
         share = np.where(first & second, 1.0, share)
-        return np.asarray(share.sum(axis=1) * (2.0 * np.pi / len(self.psi)))
+        step = 2.0 * np.pi / len(self.psi)
+        return np.asarray(share.sum(axis=1) * step)
 
     @property
     def best_cond_j(self) -> Array:
@@ -219,8 +220,8 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
     divisor = np.where(at_pole, 1.0, sine_phi)
     cosine = np.where(at_pole, 1.0, s_x / divisor)  # of theta
     sine = np.where(at_pole, 0.0, s_y / divisor)
-    along = np.stack([cosine * s_z, sine * s_z, -sine_phi], axis=-1)
-    across = np.stack([-sine, cosine, np.zeros_like(sine)], axis=-1)
+    along = vectors(cosine * s_z, sine * s_z, -sine_phi)
+    across = vectors(-sine, cosine, np.zeros_like(sine))
     angle = np.asarray(psi, dtype=float)[..., None]
     x = np.cos(angle) * along + np.sin(angle) * across
     y = np.cos(angle) * across - np.sin(angle) * along
@@ -315,12 +316,14 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
     rows = []
     z = np.array([0.0, 0.0, 1.0])
     for k, sign in product(range(3), (1.0, -1.0)):
-        angles = np.linspace(0.0, geometry.arc[k], points)
-        s = np.cos(angles)[:, None] * geometry.v[k]
-        s = s + np.sin(angles)[:, None] * cross(geometry.w[k], geometry.v[k])
-        t = np.broadcast_to(sign * geometry.w[k], s.shape)
-        # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
+        v = geometry.v[k]
+        w = geometry.w[k]
         e = geometry.e[k]
+        angles = np.linspace(0.0, geometry.arc[k], points)
+        s = np.cos(angles)[:, None] * v
+        s = s + np.sin(angles)[:, None] * cross(w, v)
+        t = np.broadcast_to(sign * w, s.shape)
+        # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
         triad = np.stack([np.cross(e, z), e, z])
         rotation = columns(cross(t, s), t, s) @ triad
         gamma, _, beta = kinematics.inverse(geometry, rotation)
@@ -328,14 +331,14 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
         in_reach = (beta > 0.0) & (beta <= geometry.beta_max)
         in_stroke = (gamma >= 0.0) & (gamma <= geometry.arc)
         is_inside = on_triangle & in_reach & in_stroke
-        is_inside[:, k] = True
+        is_inside[:, k] = True  # of the singular leg nothing is asked
         gamma[:, k] = np.nan
         beta[:, k] = np.nan
-        c = np.linalg.norm(cross(t, np.broadcast_to(geometry.w[k], t.shape)), axis=1)
-        kept = is_inside.all(axis=1)
+        c = np.linalg.norm(cross(t, np.broadcast_to(w, t.shape)), axis=1)
         leg = np.full(points, k)
-        rows.append((rotation[kept], gamma[kept], beta[kept], leg[kept], c[kept]))
-    arrays = [np.concatenate(column) for column in zip(*rows, strict=True)]
+        is_kept = is_inside.all(axis=1)
+        rows.append([array[is_kept] for array in (rotation, gamma, beta, leg, c)])
+    arrays = [np.concatenate(blocks) for blocks in zip(*rows, strict=True)]
     return SingularPoses("serial", *frozen(*arrays))
 
 

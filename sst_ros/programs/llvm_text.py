@@ -107,7 +107,8 @@ def _type_of(width: int) -> str:
 def _declare(widths: Iterable[int]) -> str:
     lines = []
     for width in widths:
-        number_type, suffix = _type_of(width), _suffix(width)
+        number_type = _type_of(width)
+        suffix = _suffix(width)
         for name in ("sqrt", "fabs"):
             lines.append(f"declare {number_type} @llvm.{name}.{suffix}({number_type})")
     for name in MATH_FUNCTIONS:
@@ -127,7 +128,8 @@ def _function_name(name: str, width: int) -> str:
 
 def _constant(value: float, width: int) -> str:
     """Return a number as LLVM writes it: its bits."""
-    bits = f"0x{struct.unpack('>Q', struct.pack('>d', value))[0]:016X}"
+    (number,) = struct.unpack(">Q", struct.pack(">d", value))
+    bits = f"0x{number:016X}"
     if width == 1:
         return bits
     return "<" + ", ".join([f"double {bits}"] * width) + ">"
@@ -152,8 +154,7 @@ def _write_function(
     With `inline` it becomes part of the function that calls it.
     """
     writer = _Writer(program, slots, width)
-    for number, (op, operands) in enumerate(program.steps):
-        writer.write_step(f"%v{number}", op, operands)
+    writer.write_steps()
     for number, output in enumerate(program.outputs):
         writer.store(writer.operand_text(output), "%o", number)
     array = f"{_pointer(_type_of(width))} noalias"
@@ -171,8 +172,7 @@ def _write_tanh(width: int) -> str:
     """Write the hyperbolic tangent as a function that becomes part of its callers."""
     program = tanh_program()
     writer = _Writer(program, Slots(), width)
-    for number, (op, operands) in enumerate(program.steps):
-        writer.write_step(f"%v{number}", op, operands)
+    writer.write_steps()
     number_type = _type_of(width)
     name = _function_name(_TANH, width)
     head = f"define internal {number_type} {name}({number_type} %a0)"
@@ -184,14 +184,15 @@ class _Writer:
     """Lines of one function; `first_lines` are those at its beginning."""
 
     def __init__(self, program: Program, slots: Slots, width: int) -> None:
+        self._program = program
         self._slots = slots
         self._width = width
         self._number_type = _type_of(width)
         self._operand_names = [f"%a{i}" for i in range(len(program.inputs))]
         self._operand_names += [f"%v{i}" for i in range(len(program.steps))]
-        self._numbers: dict[int, str] = {}
-        self._calls: dict[str, str] = {}
-        self._places = 0
+        self._numbers: dict[int, str] = {}  # names of loaded numbers by slot
+        self._calls: dict[str, str] = {}  # arrays of results by the name of a call
+        self._places = 0  # addresses that have been taken
         self.first_lines: list[str] = []
         self.lines: list[str] = []
         for number in range(len(program.inputs)):
@@ -207,7 +208,12 @@ class _Writer:
             return self._operand_names[operand]
         return _constant(operand, self._width)
 
-    def write_step(
+    def write_steps(self) -> None:
+        """Write all operations of the program."""
+        for number, (op, operands) in enumerate(self._program.steps):
+            self._write_step(f"%v{number}", op, operands)
+
+    def _write_step(
         self, result: str, op: str | Routine, operands: Sequence[float | int]
     ) -> None:
         """Write one operation of a program."""
@@ -237,8 +243,8 @@ class _Writer:
             zero = self.operand_text(0.0)
             self._choose(result, zero, texts[0], zero, texts[0])
         elif op == "step":
-            one, zero = self.operand_text(1.0), self.operand_text(0.0)
-            self._choose(result, texts[0], zero, one, zero)
+            zero = self.operand_text(0.0)
+            self._choose(result, texts[0], zero, self.operand_text(1.0), zero)
         elif op == "max":
             self._choose(result, texts[1], texts[0], texts[1], texts[0])
         elif op == "select":
