@@ -104,15 +104,17 @@ def derivative(
     acts on the star, in {B} [N m].
     """
     x, y, z, w, wx, wy, wz, *lagged = state
+    q = (x, y, z, w)
+    rate = (wx, wy, wz)
     lag_rates: tuple[Scalar, ...] = ()
     lag = model.time_constant
     if lag is not None:
         pairs = zip(torque, lagged, strict=True)
         lag_rates = tuple((command - acting) / lag for command, acting in pairs)
         torque = triple(lagged)
-    inertia, force, _ = balance(model, (x, y, z, w), (wx, wy, wz), torque, moment)
+    inertia, force, _ = balance(model, q, rate, torque, moment)
     acceleration = solve_symmetric(inertia, force)
-    return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *lag_rates)
+    return (*quaternion_rate(q, rate), *acceleration, *lag_rates)
 
 
 def actuator_torque(

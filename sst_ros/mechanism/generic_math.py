@@ -25,7 +25,13 @@ ARRAYS = (np.ndarray, np.generic, complex)
 def _function_of(name: str) -> Callable[[Any], Any]:
     """Return a function of one number: that of `math`, or of the number's own kind."""
     of_float: Callable[[float], float] = getattr(math, name)
-    return lambda x: of_float(x) if type(x) is float else _apply_by_kind(name, x)
+
+    def of_any(x: Any) -> Any:
+        if type(x) is float:
+            return of_float(x)
+        return _apply_by_kind(name, x)
+
+    return of_any
 
 
 sqrt = _function_of("sqrt")
@@ -110,7 +116,9 @@ _TANH_IS_ONE = 22.0
 
 def tanh(x: Any) -> Any:
     """Hyperbolic tangent; of floats by `tanh_steps`."""
-    return tanh_steps(x) if type(x) is float else _apply_by_kind("tanh", x)
+    if type(x) is float:
+        return tanh_steps(x)
+    return _apply_by_kind("tanh", x)
 
 
 def tanh_steps(x: Scalar) -> Scalar:
@@ -128,7 +136,8 @@ def tanh_steps(x: Scalar) -> Scalar:
     size = absolute(x)
     exponent = -2.0 * select(size - _TANH_IS_ONE, _TANH_IS_ONE, size)
     k = (exponent * (1.0 / math.log(2.0)) + TO_WHOLE) - TO_WHOLE
-    r = (exponent - k * LN_2[0]) - k * LN_2[1]
+    ln_2, remainder = LN_2
+    r = (exponent - k * ln_2) - k * remainder
     square = r * r
     fourth = square * square
     # Pairs of pairs: half of the operations do not wait for each other.

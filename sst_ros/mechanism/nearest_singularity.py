@@ -301,7 +301,8 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
     rows = _across(e, turned + 2.0 * along[..., None] * turn)
     slopes = []
     for i in range(3):
-        by_turn = axes[:, :, i, None] * turn + along[..., None] * unit[i]
+        component = axes[:, :, i, None]
+        by_turn = component * turn + along[..., None] * unit[i]
         change = by_turn - cross(unit[i], axes) - v[:, i, None, None] * axes
         slopes.append(_across(e, 2.0 * change))
     normals = np.empty(axes.shape)
@@ -317,9 +318,9 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
     for i, slope in enumerate(slopes):
         gradient[:, i] = dot(slope, normals).sum(axis=1)
         for j in range(3):
-            curved = axes[:, :, i, None] * unit[j] + axes[:, :, j, None] * unit[i]
-            curved = 2.0 * (curved - float(i == j) * axes)
-            hessian[:, i, j] += dot(_across(e, curved), normals).sum(axis=1)
+            symmetric = axes[:, :, i, None] * unit[j] + axes[:, :, j, None] * unit[i]
+            curvature = _across(e, 2.0 * (symmetric - float(i == j) * axes))
+            hessian[:, i, j] += dot(curvature, normals).sum(axis=1)
     return _Determinant(dot(rows[:, 0], normals[:, 0]), gradient, hessian)
 
 

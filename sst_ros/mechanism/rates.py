@@ -249,7 +249,8 @@ def orientation_sensitivity(
                 moved_across = cross(moved_w, v[k]) + cross(w[k], moved_v_k)
                 moved_r = cosine * moved_v_k + sine * moved_across
                 by_v[..., k, leg, axis] = _dot(moved_r, t_k)
-        e_slope = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
+        turn = turns[k]
+        e_slope = np.array([-np.cos(turn), -np.sin(turn), 0.0])
         by_turn = _dot(r_k, matrix @ e_slope)
         by_alpha[..., k, :k] = by_turn[..., None]
     j2 = cross(t, r)

@@ -114,7 +114,17 @@ def posture(
     b = -(wr @ j) / np.sum(wr * t, axis=1)[:, None]
     u = np.diag(np.sum(t * w, axis=1)) - t @ j
     return Posture(
-        gamma=angles, rotation=rotation, r=r, t=t, w=w, c=c, j2=j2, j=j, a=a, b=b, u=u
+        gamma=angles,
+        rotation=rotation,
+        r=r,
+        t=t,
+        w=w,
+        c=c,
+        j2=j2,
+        j=j,
+        a=a,
+        b=b,
+        u=u,
     )
 
 
