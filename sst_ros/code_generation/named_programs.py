@@ -17,7 +17,7 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.dynamics.traced_dynamics import LEGS, ODE, Dynamics, parameter_symbols
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, parameter_symbols
 from sst_ros.dynamics.variational import REBOUND, list_numbers, refuse_other_numbers
 from sst_ros.errors import refusal, suggestion
 from sst_ros.mechanism.geometry import Geometry
@@ -32,7 +32,7 @@ from sst_ros.scene.yaml_document import (
     plain,
     replace_values,
 )
-from sst_ros.state import cached_property
+from sst_ros.state import MOMENT, TORQUES, cached_property
 from sst_ros.version import VERSION
 
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
@@ -42,7 +42,7 @@ CALLER = "equations"  # heads the messages of what is refused
 
 # names of the arguments of the equations
 STATE_ARGUMENT = "state"
-TORQUES = "torque"
+TORQUE_ARGUMENT = "torque"
 MOMENT_ARGUMENT = "moment"
 PARAMETERS = "parameters"
 
@@ -156,11 +156,11 @@ class SceneEquations:
         meaning = "command to" if self.scene.lags else "torque of"
         torques = tuple(f"{meaning} actuator {leg} [N m]" for leg in legs)
         symbols = self.dynamics.drive
-        torque = Argument(TORQUES, symbols[:LEGS], torques)
+        torque = Argument(TORQUE_ARGUMENT, symbols[TORQUES], torques)
         if not self.dynamics.has_moment_topic:
             return (torque,)
         moments = tuple(f"moment on the star, {axis} in {{B}} [N m]" for axis in "xyz")
-        return torque, Argument(MOMENT_ARGUMENT, symbols[LEGS:], moments)
+        return torque, Argument(MOMENT_ARGUMENT, symbols[MOMENT], moments)
 
     @property
     def open(self) -> tuple[Argument, ...]:

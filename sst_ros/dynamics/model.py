@@ -15,7 +15,7 @@ from sst_ros.mechanism.generic_math import Symmetric, Triple, cross3, multiply, 
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
-from sst_ros.state import ZERO
+from sst_ros.state import JOINT_COUNT, ZERO
 
 LEGS = 3
 JOINT_NAMES = ("gamma", "mu", "beta")  # of a leg, from the base to the star
@@ -23,8 +23,6 @@ JOINT_NAMES = ("gamma", "mu", "beta")  # of a leg, from the base to the star
 GAMMA = 0
 MU = 1
 BETA = 2
-# of the gammas, mus and betas of all legs, whose rates follow them in the same order
-ANGLE_COUNT = len(JOINT_NAMES) * LEGS
 # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
 SINGULAR_MU = 1e-6
 # farther beyond than this [rad], an actuator has not just reached the contact
@@ -294,7 +292,7 @@ class Limit(NamedTuple):
 
     def slope(self, joints: Sequence[float]) -> float:
         """Rate of the distance [rad/s]."""
-        return self.sign * joints[self.joint + ANGLE_COUNT]
+        return self.sign * joints[self.joint + JOINT_COUNT]
 
 
 def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
@@ -386,6 +384,6 @@ def transitions_of(scene: Any, tolerance: float) -> tuple[Transition, ...]:
         if width < _RESOLVED * tolerance:
             continue
         for k in range(LEGS):
-            rate = ANGLE_COUNT + joint * LEGS + k
+            rate = JOINT_COUNT + joint * LEGS + k
             transitions.append(Transition(rate, edge * friction.smoothing, width))
     return tuple(transitions)

@@ -37,7 +37,6 @@ from sst_ros.dynamics.model import LEGS, Model, actuated_inertia
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     MOTION,
-    RATE_ROWS,
     STATE_SIZE,
     TORQUE_SYMBOLS,
     Dynamics,
@@ -72,7 +71,7 @@ from sst_ros.programs.expression import (
 from sst_ros.scene.bodies import entries_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import leaves, rebuild
-from sst_ros.state import ZERO, Explained, cached_property
+from sst_ros.state import STAR_RATE, ZERO, Explained, cached_property
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -341,7 +340,7 @@ def _legs(
     """Solve for the reactions of the legs under torques that act."""
     without_lag = model._replace(time_constant=None)  # these torques act already
     slope = kernel.derivative(without_lag, tuple(state), torque)
-    return _solve(scene, model, state, triple(slope[RATE_ROWS]), torque)
+    return _solve(scene, model, state, triple(slope[STAR_RATE]), torque)
 
 
 def _flatten(tree: Any) -> list[Scalar]:

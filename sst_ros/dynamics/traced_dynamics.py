@@ -40,7 +40,7 @@ from sst_ros.programs.expression import (
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.state import ZERO, Joints, cached_property
+from sst_ros.state import MOMENT, STAR_RATE, TORQUES, ZERO, Joints, cached_property
 
 Function = Callable[..., Sequence[float]]
 
@@ -53,10 +53,6 @@ MOMENT_SYMBOLS = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
 
 STATE_SIZE = len(MOTION)  # of a state without lagged torques
-# where a state has its quaternion, its body rate, and both
-QUATERNION_ROWS = slice(0, len(QUATERNION_SYMBOLS))
-RATE_ROWS = slice(len(QUATERNION_SYMBOLS), STATE_SIZE)
-MOTION_ROWS = slice(0, STATE_SIZE)
 
 
 def parameter_symbols(count: int) -> tuple[str, ...]:
@@ -208,7 +204,7 @@ class Dynamics:
             slope = kernel.derivative(
                 self.model, state, torque, triple(moment) if moment else None
             )
-            body_acceleration = triple(slope[RATE_ROWS])
+            body_acceleration = triple(slope[STAR_RATE])
             gamma_ddot = kernel.actuator_acceleration(
                 self.model, state, body_acceleration
             )
@@ -272,7 +268,7 @@ class ODE:
         self.state = (*dynamics.state, "work") if work else dynamics.state
         self.drive = dynamics.drive
         if torque is not None and not phases:
-            self.drive = dynamics.drive[LEGS:]
+            self.drive = dynamics.drive[MOMENT]
         self._inputs = ("t", *self.state, *self.drive)
         self._of_numbers = partial(self.derivative, numbered=True)
 
@@ -349,7 +345,7 @@ class ODE:
             limit = number_constants(limit, ("limit",))
         state = inputs[: len(self.dynamics.state)]
         drive = inputs[len(self.state) :]
-        torque, moment = drive[:LEGS], drive[LEGS:]
+        torque, moment = drive[TORQUES], drive[MOMENT]
         if sine is not None:
             phase = torque
             if not self._phases:

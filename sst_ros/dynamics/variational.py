@@ -30,9 +30,6 @@ from sst_ros.dynamics.model import damping_of
 from sst_ros.dynamics.traced_dynamics import (
     LEGS,
     MOTION,
-    MOTION_ROWS,
-    QUATERNION_ROWS,
-    RATE_ROWS,
     STATE_SIZE,
     TORQUE_SYMBOLS,
     Dynamics,
@@ -70,7 +67,7 @@ from sst_ros.scene.torque_profile import (
     TorqueTable,
 )
 from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace_values
-from sst_ros.state import Array, clamp, freeze
+from sst_ros.state import QUATERNION, STAR, STAR_RATE, Array, clamp, freeze
 
 SENSITIVITY_TOLERANCE = 1e-12
 """Error of a step, relative and absolute; the latter over the size of a parameter."""
@@ -299,17 +296,17 @@ class VariationalEquations:
         """Return the initial state, and derivatives by parameters and torques."""
         torque_count = len(_numbers(self._torque)) if self._by_torque else 0
         state = np.zeros(len(Dynamics.of(scene).state))
-        state[MOTION_ROWS] = initial_state(scene, self._geometry)
+        state[STAR] = initial_state(scene, self._geometry)
         slopes = np.zeros((len(state), len(self.names) + torque_count))
         own = [i for i, name in enumerate(self.names) if name.startswith("initial")]
         shaped = [i for i, name in enumerate(self.names) if name.startswith(GEOMETRY)]
         if not own and not shaped:
             return state, slopes
-        by_joints = self._start_by_joints(state[MOTION_ROWS])
+        by_joints = self._start_by_joints(state[STAR])
         if shaped:  # the star moves so that gamma and gamma_dot stay
-            start = state[MOTION_ROWS, None]
+            start = state[STAR, None]
             by_geometry = self.differentiate_joints_by_geometry(start)[shaped, :, 0]
-            slopes[MOTION_ROWS, shaped] = -by_joints @ by_geometry.T
+            slopes[STAR, shaped] = -by_joints @ by_geometry.T
         for i in own:
             name = self.names[i]
             first = LEGS if name.startswith("initial.gamma_dot") else 0
@@ -317,7 +314,7 @@ class VariationalEquations:
             if name.endswith("]"):
                 legs = [int(name[-2])]  # a single digit stands before the bracket
             columns = [first + leg for leg in legs]
-            slopes[MOTION_ROWS, i] = by_joints[:, columns].sum(axis=1)
+            slopes[STAR, i] = by_joints[:, columns].sum(axis=1)
         return state, slopes
 
     def _start_by_joints(self, start: Array) -> Array:
@@ -327,10 +324,10 @@ class VariationalEquations:
         both in {E}. SingularConfiguration is raised where there is none.
         """
         tangent = np.zeros((STATE_SIZE, 6))
-        tangent[RATE_ROWS, LEGS:] = np.eye(3)
+        tangent[STAR_RATE, LEGS:] = np.eye(3)
         for i, axis in enumerate(np.eye(3)):
-            tangent[QUATERNION_ROWS, i] = quaternion_rate(
-                tuple(start[QUATERNION_ROWS]), tuple(axis)
+            tangent[QUATERNION, i] = quaternion_rate(
+                tuple(start[QUATERNION]), tuple(axis)
             )
         forward = self.differentiate_joints(start[:, None])[..., 0].T @ tangent
         try:
@@ -585,9 +582,9 @@ class Sensitivities:
     def at(self, t: Array) -> dict[str, Sensitivity]:
         """Return sensitivities by parameter name at ascending times [s] >= 0, (n,)."""
         states, state_slopes = self._equations.run(self._values, t)
-        motion = states[:, MOTION_ROWS].T
-        slopes = state_slopes[:, MOTION_ROWS]
-        q = tuple(motion[QUATERNION_ROWS])
+        motion = states[:, STAR].T
+        slopes = state_slopes[:, STAR]
+        q = tuple(motion[QUATERNION])
         turn = np.array([quaternion_rate(q, tuple(axis)) for axis in np.eye(3)])
         rates = np.einsum(
             "qcn,nqp->ncp", self._equations.differentiate_joints(motion), slopes
@@ -595,13 +592,13 @@ class Sensitivities:
         by_geometry = self._equations.differentiate_joints_by_geometry(motion)
         rates[..., : len(by_geometry)] += np.moveaxis(by_geometry, (0, 2), (2, 0))
         # quaternion_rate(q, .) has orthogonal columns of length abs(q) / 2.
-        by_quaternion = slopes[:, QUATERNION_ROWS]
+        by_quaternion = slopes[:, QUATERNION]
         rotation = 4.0 * np.einsum("cqn,nqp->ncp", turn, by_quaternion)
         by_all_numbers = Sensitivity(
             gamma=rates[:, :LEGS],
             gamma_dot=rates[:, LEGS:],
             rotation=rotation,
-            body_rate=slopes[:, RATE_ROWS],
+            body_rate=slopes[:, STAR_RATE],
         )
         sensitivities = {}
         for name, columns in self._columns.items():
