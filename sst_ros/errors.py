@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.removed import REMOVED_ARGUMENTS
-from sst_ros.state import Array, NotNumbers, TimesLike, real_numbers
+from sst_ros.state import Array, NotNumbers, TimesLike, cached_property, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN_CHARACTERS = 80  # of a value in a message
@@ -232,51 +232,61 @@ _FAILURES = (
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class _ArgumentCheck:
+    """What the annotations of a function say of its arguments."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._names = list(inspect.signature(function).parameters)
+        qualified_name = function.__qualname__.removesuffix(".__init__")
+        _, _, last_name = qualified_name.rpartition(".")  # a class's, of its __init__
+        self._origin = last_name.lower()
+
+    @cached_property
+    def _kinds(self) -> dict[str, tuple[Kind | None, bool]]:
+        """The kind of each argument, and whether it may be None."""
+        hints = inspect.get_annotations(self._function, eval_str=True)
+        return {
+            name: (_kind_of(hint), NoneType in get_args(hint))
+            for name, hint in hints.items()
+        }
+
+    def _find_fault(self, name: str, value: Any) -> str:
+        """Return why an argument is refused; "" if it is not."""
+        if name not in self._names and name in REMOVED_ARGUMENTS:
+            return REMOVED_ARGUMENTS[name]
+        kind, optional = self._kinds.get(name, (None, False))
+        if kind is None or (optional and value is None):
+            return ""
+        return kind.find_fault(value)
+
+    def check(self, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        """Raise InputError with each argument of another kind."""
+        problems = []
+        for name, value in [*zip(self._names, args, strict=False), *options.items()]:
+            if fault := self._find_fault(name, value):
+                problems.append(Problem(name, value, fault))
+        if problems:
+            raise InputError(self._origin, problems)
+
+
 def check_kinds(function: F, *, late: bool = False) -> F:
     """Raise InputError for arguments of another kind than a function's annotations.
 
     Annotations are those of `_ARGUMENT_KINDS`, and classes, with or without `| None`.
     What else an argument must be is checked by the function itself.
     """
-    names = list(inspect.signature(function).parameters)
-    qualified_name = function.__qualname__.removesuffix(".__init__")
-    _, _, last_name = qualified_name.rpartition(".")  # of the function, or of its class
-    origin = last_name.lower()
-
-    @functools.cache
-    def kinds() -> dict[str, tuple[Kind | None, bool]]:
-        """Return the kind of each argument, and whether it may be None."""
-        hints = inspect.get_annotations(function, eval_str=True)
-        return {
-            name: (_kind_of(hint), NoneType in get_args(hint))
-            for name, hint in hints.items()
-        }
-
-    def find_fault(name: str, value: Any) -> str:
-        if name not in names and name in REMOVED_ARGUMENTS:
-            return REMOVED_ARGUMENTS[name]
-        kind, optional = kinds().get(name, (None, False))
-        if kind is None or (optional and value is None):
-            return ""
-        return kind.find_fault(value)
-
-    def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:
-        problems = []
-        for name, value in [*zip(names, args, strict=False), *options.items()]:
-            if fault := find_fault(name, value):
-                problems.append(Problem(name, value, fault))
-        if problems:
-            raise InputError(origin, problems)
+    arguments = _ArgumentCheck(function)
 
     @functools.wraps(function)
     def call(*args: Any, **options: Any) -> Any:
         if not late:
-            check(args, options)
+            arguments.check(args, options)
             return function(*args, **options)
         try:
             return function(*args, **options)
         except _FAILURES:
-            check(args, options)
+            arguments.check(args, options)
             raise
 
     return cast("F", call)

@@ -197,7 +197,8 @@ def balance(
 class InertiaForces(NamedTuple):
     """What the inertia of a leg takes at its coordinates a and gamma.
 
-    It is row.W_dot plus what W_dot = 0 leaves, less the torque of the actuator.
+    That is a_row.W_dot + a at a, and gamma_row.W_dot + gamma, less the torque of the
+    actuator, at gamma.
     """
 
     a_row: Triple

@@ -163,9 +163,9 @@ class VariationalEquations:
         """Integrate from a state, (m,), and its derivatives, (m, k), to times t [s].
 
         The last of the k numbers are the parameters, with these values, and those of
-        the torques; of others the motion depends by its state alone. Returns as `run`,
-        None where there is no motion, or where it needs more evaluations than
-        MOST_MOTION_EVALUATIONS.
+        the torques; the numbers before them change the motion by its initial state
+        alone. Returns what `run` does, or None where there is no motion, or where it
+        needs more evaluations than MOST_MOTION_EVALUATIONS.
         """
         from scipy.integrate import solve_ivp  # takes 0.3 s, which few runs need
 
@@ -193,11 +193,12 @@ class VariationalEquations:
         begin = 0.0
         for stop in np.append(np.unique(inside), end).tolist():
             reached = (t > begin) & (t <= stop)
-            law = self._torque.piece(begin, stop), self._forcing(begin, stop, limit)
+            piece = self._torque.piece(begin, stop)
+            forcing = self._forcing(begin, stop, limit)
             try:
                 run = solve_ivp(
                     rates, (begin, stop), y, "DOP853", np.union1d(t[reached], stop),
-                    rtol=tolerance, atol=tolerance * absolute, args=law,
+                    rtol=tolerance, atol=tolerance * absolute, args=(piece, forcing),
                 )  # fmt: skip
             except (ArithmeticError, ValueError):
                 return None

@@ -100,8 +100,11 @@ def _reach(programs: Mapping[str, Program], name: str) -> set[str]:
     return names
 
 
-def _type_of(width: int) -> str:
-    return "double" if width == 1 else f"<{width} x double>"
+def _type_of(width: int, element: str = "double") -> str:
+    """Return the type of a number, or of a vector with one in each lane."""
+    if width == 1:
+        return element
+    return f"<{width} x {element}>"
 
 
 def _declare(widths: Iterable[int]) -> str:
@@ -127,19 +130,16 @@ def _function_name(name: str, width: int) -> str:
 
 
 def _constant(value: float, width: int) -> str:
-    """Return a number as LLVM writes it: its bits."""
-    (number,) = struct.unpack(">Q", struct.pack(">d", value))
-    bits = f"0x{number:016X}"
-    if width == 1:
-        return bits
-    return "<" + ", ".join([f"double {bits}"] * width) + ">"
+    """Return a number as LLVM writes it, its bits, in each lane."""
+    (bits,) = struct.unpack(">Q", struct.pack(">d", value))
+    return _repeat(f"0x{bits:016X}", width, "double")
 
 
-def _whole_constant(value: int, width: int) -> str:
-    """Return a whole number as an operand."""
+def _repeat(constant: str, width: int, element: str) -> str:
+    """Return a constant of a type in each lane."""
     if width == 1:
-        return str(value)
-    return "<" + ", ".join([f"i64 {value}"] * width) + ">"
+        return constant
+    return "<" + ", ".join([f"{element} {constant}"] * width) + ">"
 
 
 def _pointer(target_type: str) -> str:
@@ -266,7 +266,7 @@ class _Writer:
 
     def _choose(self, result: str, left: str, right: str, yes: str, no: str) -> None:
         """Write: yes where left > right, else no."""
-        truth = "i1" if self._width == 1 else f"<{self._width} x i1>"
+        truth = _type_of(self._width, "i1")
         condition = f"%c{result[1:]}"
         self._put(condition, f"fcmp ogt {self._number_type} {left}, {right}")
         self._put(
@@ -282,9 +282,9 @@ class _Writer:
         would have no value where k is no number.
         """
         number_type = self._number_type
-        integer_type = "i64" if self._width == 1 else f"<{self._width} x i64>"
-        mantissa_size = _whole_constant(52, self._width)
-        bits_of_one = _whole_constant(1023 << 52, self._width)
+        integer_type = _type_of(self._width, "i64")
+        mantissa_size = _repeat("52", self._width, "i64")
+        bits_of_one = _repeat(str(1023 << 52), self._width, "i64")
         name = f"%w{result[1:]}"
         self._put(
             f"{name}.k", f"fadd {number_type} {exponent}, {self.operand_text(TO_WHOLE)}"
