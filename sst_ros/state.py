@@ -305,10 +305,6 @@ def _say(value: object) -> str:
     return textwrap.shorten(str(value), 200, placeholder=" ...")
 
 
-_JOINT_PLACES = tuple(slice(first, first + 3) for first in range(0, 18, 3))
-"""Where 18 numbers have the three of each kind of angle and rate."""
-
-
 class Joints(NamedTuple):
     """Angles [rad] and rates [rad/s] of all nine joints, by kind and leg."""
 
@@ -348,9 +344,20 @@ class State(Explained):
 
         y begins with quaternion and body rate; `joints` are 18 angles and rates.
         """
-        numbers: Any = joints if type(joints) is tuple else tuple(joints)
-        by_kind = Joints(*[numbers[places] for places in _JOINT_PLACES])
         qx, qy, qz, qw, wx, wy, wz, *_ = y
+        (
+            gamma_1, gamma_2, gamma_3, mu_1, mu_2, mu_3, beta_1, beta_2, beta_3,
+            gamma_dot_1, gamma_dot_2, gamma_dot_3, mu_dot_1, mu_dot_2, mu_dot_3,
+            beta_dot_1, beta_dot_2, beta_dot_3,
+        ) = joints  # fmt: skip
+        by_kind = Joints(
+            (gamma_1, gamma_2, gamma_3),
+            (mu_1, mu_2, mu_3),
+            (beta_1, beta_2, beta_3),
+            (gamma_dot_1, gamma_dot_2, gamma_dot_3),
+            (mu_dot_1, mu_dot_2, mu_dot_3),
+            (beta_dot_1, beta_dot_2, beta_dot_3),
+        )
         return cls(time_ns, (qx, qy, qz, qw), (wx, wy, wz), by_kind, torque)
 
     def _facts(self) -> dict[str, object]:

@@ -30,7 +30,7 @@ Below it rounding, over its square, leaves gamma_dot less than six digits.
 NO_ASSEMBLY = -1  # gamma has no unique admissible assembly
 NO_RATE = -2  # gamma_dot is no motion there
 
-BLOCK = 2000  # starts solved at once: their arrays fit the cache
+STARTS_AT_ONCE = 2000  # starts solved at once: their arrays fit the cache
 
 
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
@@ -86,8 +86,8 @@ def initial_states(
     quaternions[-1] = 1.0
     rates = np.zeros((3, count))
     codes = np.full(count, NO_ASSEMBLY, dtype=np.int64)
-    for first in range(0, count, BLOCK):
-        block = slice(first, first + BLOCK)
+    for first in range(0, count, STARTS_AT_ONCE):
+        block = slice(first, first + STARTS_AT_ONCE)
         # Equal starts, a geometry and its gamma, are solved once.
         starts = np.column_stack([geometry_index[block], gamma[block]])
         distinct, start_of_row = np.unique(starts, axis=0, return_inverse=True)

@@ -28,11 +28,11 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from sst_ros.dynamics.model import (
-    BETA,
-    GAMMA,
+    AT_BETA,
+    AT_GAMMA,
+    AT_MU,
     JOINT_NAMES,
     LEGS,
-    MU,
     ElasticStops,
     Leg,
     Model,
@@ -243,8 +243,8 @@ def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
     of_legs = []
     for motion in leg_motions(model, state):
-        angles = [joint_angle(motion, joint) for joint in (GAMMA, MU, BETA)]
-        rates = [joint_rate(motion, joint) for joint in (GAMMA, MU, BETA)]
+        angles = [joint_angle(motion, joint) for joint in (AT_GAMMA, AT_MU, AT_BETA)]
+        rates = [joint_rate(motion, joint) for joint in (AT_GAMMA, AT_MU, AT_BETA)]
         of_legs.append([*angles, *rates])
     return Joints(*zip(*of_legs, strict=True))
 
@@ -343,7 +343,7 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
                 stretch = joint_angle(motion, joint) - spring.rest
                 own = own + 0.5 * spring.stiffness * stretch * stretch
         if leg.stops is not None:
-            gamma = joint_angle(motion, GAMMA)
+            gamma = joint_angle(motion, AT_GAMMA)
             for depth in (positive(-gamma), positive(gamma - leg.stops.arc)):
                 own = own + 0.5 * leg.stops.stiffness * depth * depth
         if any(leg.drive) or any(leg.link):
@@ -397,7 +397,7 @@ def _lost_power(motion: LegMotion) -> Scalar:
             rate = joint_rate(motion, joint)
             lost = lost + friction_torque(friction, rate) * rate
     if leg.stops is not None and leg.stops.damping:
-        gamma = joint_angle(motion, GAMMA)
+        gamma = joint_angle(motion, AT_GAMMA)
         speed = motion.gamma_dot
         elastic = leg.stops._replace(damping=0.0)
         elastic_torque = stop_torque(elastic, gamma, speed)
@@ -414,7 +414,7 @@ def joint_torques(motion: LegMotion, field: Triple) -> Triple:
     """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
     leg = motion.leg
     torques = []
-    for joint in (GAMMA, MU, BETA):
+    for joint in (AT_GAMMA, AT_MU, AT_BETA):
         rubbing = 0.0
         restoring = 0.0
         friction = leg.friction[joint]
@@ -434,7 +434,7 @@ def joint_torques(motion: LegMotion, field: Triple) -> Triple:
         at_gamma = dot3(add(on_link, on_drive), motion.axis)
         at_mu = -dot3(on_link, r)
     if leg.stops is not None:
-        gamma = joint_angle(motion, GAMMA)
+        gamma = joint_angle(motion, AT_GAMMA)
         at_gamma = at_gamma + stop_torque(leg.stops, gamma, motion.gamma_dot)
     of_gamma, of_mu, of_beta = torques
     return of_gamma + at_gamma, of_mu + at_mu, of_beta
@@ -526,28 +526,28 @@ def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar
 
 
 def joint_rate(motion: LegMotion, joint: int) -> Scalar:
-    """Rate of a joint, GAMMA, MU or BETA [rad/s]."""
-    if joint == GAMMA:
+    """Rate of a joint, AT_GAMMA, AT_MU or AT_BETA [rad/s]."""
+    if joint == AT_GAMMA:
         return motion.gamma_dot
-    if joint == MU:
+    if joint == AT_MU:
         return -motion.a_dot / sqrt(motion.u)
     return motion.beta_dot
 
 
 def joint_angle(motion: LegMotion, joint: int) -> Scalar:
-    """Angle of a joint, GAMMA, MU or BETA [rad]."""
+    """Angle of a joint, AT_GAMMA, AT_MU or AT_BETA [rad]."""
     return atan2(*direction_of(motion, joint))
 
 
 def direction_of(motion: LegMotion, joint: int) -> tuple[Scalar, Scalar]:
-    """Sine and cosine of the angle of a joint, GAMMA, MU or BETA.
+    """Sine and cosine of the angle of a joint, AT_GAMMA, AT_MU or AT_BETA.
 
     Those of gamma and beta are multiplied by sqrt(u).
     """
-    if joint == GAMMA:
+    if joint == AT_GAMMA:
         leg = motion.leg
         return dot3(motion.outward, leg.across), dot3(motion.outward, leg.v)
-    if joint == MU:
+    if joint == AT_MU:
         return sqrt(motion.u), motion.a
     # p.(t x s) and p.s with s = (0, 0, 1)
     t_x, t_y, _ = motion.along

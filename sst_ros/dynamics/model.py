@@ -20,9 +20,9 @@ from sst_ros.state import JOINT_COUNT, ZERO
 LEGS = 3
 JOINT_NAMES = ("gamma", "mu", "beta")  # of a leg, from the base to the star
 # their places in the joints of a leg
-GAMMA = 0
-MU = 1
-BETA = 2
+AT_GAMMA = 0
+AT_MU = 1
+AT_BETA = 2
 # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
 SINGULAR_MU = 1e-6
 # farther beyond than this [rad], an actuator has not just reached the contact
@@ -324,7 +324,7 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
 
     for k in range(LEGS):
         singular = f"serial singularity, mu_{k + 1}"
-        mu = MU * LEGS + k
+        mu = AT_MU * LEGS + k
         yield Limit(f"{singular} = 0", SingularityReached, mu, 1.0, SINGULAR_MU)
         most = math.pi - SINGULAR_MU
         yield Limit(f"{singular} = pi", SingularityReached, mu, -1.0, most)
@@ -335,7 +335,7 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
             yield Limit(above(name, arc), StrokeExceeded, k, -1.0, arc)
         if scene.workspace.at_edge == "stop":
             name = f"beta_{k + 1}"
-            beta = BETA * LEGS + k
+            beta = AT_BETA * LEGS + k
             edge = geometry.beta_max
             yield Limit(f"{name} < 0", WorkspaceLeft, beta, 1.0, 0.0)
             yield Limit(above(name, edge), WorkspaceLeft, beta, -1.0, edge)

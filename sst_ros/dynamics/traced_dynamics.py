@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
+from sst_ros.dynamics.model import AT_MU, Limit, limits_of
 from sst_ros.dynamics.model import LEGS as LEGS
-from sst_ros.dynamics.model import MU, Limit, limits_of
 from sst_ros.errors import Check, refuse_unless
 from sst_ros.mechanism.generic_math import Scalar, positive, sin, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -292,12 +292,11 @@ class ODE:
         Raises ArithmeticError where it is not finite.
         """
         size = len(self.state)
-        rows = np.array(self.linearised(t, *y, *d)).reshape(-1, size)
-        _derivative, _by_time, *by_state = rows
-        slopes: Array = np.array(by_state)
+        first = 2 * size  # of the slopes by state, behind the derivative and that by t
+        slopes = np.array(self.linearised(t, *y, *d)[first:])
         if not np.isfinite(slopes).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return np.asarray(slopes.T)
+        return np.asarray(slopes.reshape(size, size).T, dtype=float)
 
     @cached_property
     def slope(self) -> Function:
@@ -387,7 +386,7 @@ def limit_distances(
     for limit, (cosine, sine) in zip(limits, ends, strict=True):
         joint, number = divmod(limit.joint, LEGS)
         leg = legs[number]
-        if joint == MU:  # sin(mu)^2 - sin(end)^2
+        if joint == AT_MU:  # sin(mu)^2 - sin(end)^2
             distance = leg.u - sine * sine
             rate = -2.0 * leg.a * leg.a_dot
         else:  # sqrt(u) sin(sign * (angle - end))

@@ -28,7 +28,9 @@ from sst_ros.mechanism.kinematics import CLOSURE_ROUNDING, rotate
 
 SAFE_STEP = 0.18  # in gamma [rad] over sigma^2; a longer one might leave the branch
 LEAST_SIGMA = 1e-5  # at which a branch is followed
-CLOSED = 1e-9  # largest abs(r_k . t_k) of a rotation that is given as an assembly
+ASSEMBLY_RESIDUAL = (
+    1e-9  # largest abs(r_k . t_k) of a rotation that is given as an assembly
+)
 ITERATIONS = 20  # of Newton's method at most: it converges quadratically
 MOST_STEPS = 20_000  # between two points
 SQRT2 = 2.0**0.5
@@ -80,7 +82,7 @@ def follow(
     rotations = np.empty((len(points), 3, 3))
     rotations[0] = rotate(np.array(rotation, dtype=float), np.zeros(3))
     residual = kinematics.closure(geometry, points[0], rotations[0])
-    if np.abs(residual).max() > CLOSED:
+    if np.abs(residual).max() > ASSEMBLY_RESIDUAL:
         raise AssemblyError("rotation does not close the loops", points[0])
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):

@@ -22,7 +22,7 @@ from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
 from sst_ros.state import Explained
 
-KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
+SCENE_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 """Numbers of a scene that its geometry is made from."""
 
 SMALL = 1000  # numbers of an array below which `take` is faster than slices
@@ -121,7 +121,7 @@ class Geometry(Explained):
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
         """Derive the distinct geometries of `Scenarios`, and which each row has."""
         scene = scenarios.document
-        columns_by_key = [scenarios.rows.get(key) for key in KEYS]
+        columns_by_key = [scenarios.rows.get(key) for key in SCENE_KEYS]
         varied = []
         for values in columns_by_key:
             if values is not None:

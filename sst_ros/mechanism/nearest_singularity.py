@@ -47,13 +47,13 @@ from sst_ros.state import Explained
 RAYS = 400  # from a pose, along which det J2 is evaluated
 RAY_POINTS = 64  # of a ray: two changes of sign between two of them are overlooked
 REFINED = 6  # nearest changes of sign that are refined
-SINGULAR = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
+SINGULAR_SHARE = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 POSES_AT_ONCE = 100  # some 100 MB of polynomials along rays
 NEWTON_STEPS = 60  # most of them; a start beside a solution takes five
 LONGEST_STEP = 0.2  # of v: a longer one may lead to another solution
 LAST_STEP = 1e-9  # of v: after it rounding is reached, for convergence is quadratic
 FLAT = 1e-200  # squared gradient below which there is no direction to a solution
-DEGREE = 6  # of det J2 along a ray as a polynomial in tau
+DETERMINANT_DEGREE = 6  # of det J2 along a ray as a polynomial in tau
 SHORT_OF_SERIAL = 1.0 - 1e-9  # share of a ray; at its end det J2 is zero in any case
 
 
@@ -231,7 +231,7 @@ def _first_changes(geometry: Geometry, axes: Array, nearest: Array) -> _Changes:
     angles = 2.0 * np.arctan(norm(nearest))
     shares = np.linspace(0.0, SHORT_OF_SERIAL, RAY_POINTS)
     tau = np.tan(0.5 * angles[:, None] * shares)
-    powers = tau[:, None, :] ** np.arange(DEGREE + 1)[:, None]
+    powers = tau[:, None, :] ** np.arange(DETERMINANT_DEGREE + 1)[:, None]
     polynomials = _det_along(geometry.e, axes, rays)
     values = polynomials @ powers
     is_beyond = values * polynomials[:, :1, :1] <= 0.0
@@ -270,7 +270,7 @@ def _det_along(e: Array, axes: Array, rays: Array) -> Array:
     for i, second in enumerate(rows):
         for j, third in enumerate(rows):
             normals[i + j] += cross(second[:, :, 1], third[:, :, 2])
-    polynomials = np.zeros((*count, DEGREE + 1))
+    polynomials = np.zeros((*count, DETERMINANT_DEGREE + 1))
     for i, first in enumerate(rows):
         for degree, normal in enumerate(normals):
             polynomials[:, :, i + degree] += dot(first[:, :, 0], normal)
@@ -353,7 +353,7 @@ def _least_turns(
         is_singular[active[is_last & is_slope]] = True
         active = active[~is_last]
     determinant = _determinant(e, axes, v)
-    is_singular &= np.abs(determinant.value) < SINGULAR * sizes
+    is_singular &= np.abs(determinant.value) < SINGULAR_SHARE * sizes
     return v, is_singular
 
 

@@ -25,9 +25,9 @@ from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen, 
 from sst_ros.progress import slices
 from sst_ros.state import Explained
 
-BLOCK = 20_000  # poses that are measured at a time
+MEASURED_AT_ONCE = 20_000  # poses that are measured at a time
 BISECTIONS = 55  # of psi between two samples: to rounding
-MOST_POSES = 20_000_000  # of a map: 4 GB
+MOST_MAP_POSES = 20_000_000  # of a map: 4 GB
 SMOOTH = 1.0  # change of gamma [rad] between two samples that is no jump by pi
 
 
@@ -171,8 +171,8 @@ def workspace(
     a full turn. InputError refuses less than 1 of them. With `progress` a bar is drawn
     on a terminal.
     """
-    is_small = int(divisions) ** 2 * int(turns) // 2 <= MOST_POSES
-    requirement = f"must be at least 1, and make no more than {MOST_POSES:g} poses"
+    is_small = int(divisions) ** 2 * int(turns) // 2 <= MOST_MAP_POSES
+    requirement = f"must be at least 1, and make no more than {MOST_MAP_POSES:g} poses"
     refuse_unless(
         "workspace",
         ("divisions", divisions, divisions >= 1 and is_small, requirement),
@@ -194,7 +194,7 @@ def over_orientations(
     step = 2.0 * np.pi / turns
     psi = np.asarray((np.arange(turns) + 0.5) * step - np.pi, dtype=float)
     measured = []
-    size = max(1, BLOCK // turns)
+    size = max(1, MEASURED_AT_ONCE // turns)
     for block in slices(len(directions), size, "orientations", progress):
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
