@@ -15,13 +15,12 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-from sst_ros.dynamics.traced_dynamics import QUATERNION_SYMBOLS, STATE_SIZE
 from sst_ros.errors import RunStopped, SstError
 from sst_ros.mechanism.generic_math import add, axpy
 from sst_ros.runtime.torque_input import RunSettings, TorqueInput
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import NANOSECONDS, ZERO, State, Vector3
+from sst_ros.state import NANOSECONDS, STAR_RATE, ZERO, State, Vector3
 
 _LONGEST_SLEEP_S = 0.05
 """Longest sleep between two looks at what may interrupt a wait."""
@@ -47,9 +46,6 @@ _LONGEST_WAIT_S = 0.1
 
 Deadlines may be far, and a followed clock may stand.
 """
-
-_BODY_ACCELERATION = slice(len(QUATERNION_SYMBOLS), STATE_SIZE)
-"""Its numbers in the derivative of the state."""
 
 RunOutput: TypeAlias = Any
 """Where a run publishes: has the methods of `nodes.publications.SimulatorTopics`."""
@@ -288,7 +284,7 @@ class HeldTorques:
         y = (*state.quaternion, *state.body_rate)
         other_inputs = (0.0,) * (len(dynamics.drive) - len(ZERO))
         without, by_late, by_lost = (
-            dynamics.derivative(*y, *torque, *other_inputs)[_BODY_ACCELERATION]
+            dynamics.derivative(*y, *torque, *other_inputs)[STAR_RATE]
             for torque in (ZERO, late, lost)
         )
         of_start = 0.5 * period * math.dist(by_late, without)
