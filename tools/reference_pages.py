@@ -85,7 +85,7 @@ def commands_tables() -> Iterator[tuple[str, str]]:
                 _table(("argument", "what"), rows) if rows else "No arguments.\n"
             )
             text += (
-                f"## {name}\n\n{entry.what[:1].upper()}{entry.what[1:]}.\n\n"
+                f"## {name}\n\n{entry.description[:1].upper()}{entry.description[1:]}.\n\n"
                 f"{arguments_of}\n"
             )
     yield "commands", text

@@ -45,7 +45,7 @@ _LARGEST_TORQUE = 5.0
 """Range of the torque sliders where the scene has no limit [N m]."""
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
-"""Time for which a refusal is shown."""
+"""Time for which a refusal is contents."""
 _WINDOW_S = 10.0
 """Time that the plots show."""
 _CURVE_POINTS = 500
@@ -91,8 +91,8 @@ class _PlotSample(NamedTuple):
     torque: Sequence[float]  # [N m], shape (3,)
 
 
-class _Shown(NamedTuple):
-    """A scene on the page, and what of the page changes while it is shown."""
+class _PageContents(NamedTuple):
+    """A scene on the page, and what of the page changes while it is contents."""
 
     scene: Scene
     drawing: SceneDrawing
@@ -118,7 +118,7 @@ class Page:
         # No markdown: viser sends its text as an update, which a slow browser complains
         # of where it gets the removal at once with it.
         self._server.gui.add_html("<small>&nbsp; Waiting for a simulator ...</small>")
-        self._shown: _Shown | None = None
+        self._contents: _PageContents | None = None
         self._state: ViewState | None = None  # the last one
         self._samples: deque[_PlotSample] = deque(maxlen=_CURVE_POINTS)
         self._stop = threading.Event()
@@ -143,16 +143,16 @@ class Page:
         for frame in itertools.count():
             scene = self._source.scene
             if scene is not None and not self._shows(scene):
-                self._shown = self._build(scene)
-            if self._shown is not None:
+                self._contents = self._build(scene)
+            if self._contents is not None:
                 with self._server.atomic():
-                    self._update(self._shown, frame)
+                    self._update(self._contents, frame)
             due = max(due + PERIOD_S, time.monotonic())  # late frames are dropped
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
 
     def _shows(self, scene: Scene) -> bool:
-        return self._shown is not None and self._shown.scene == scene
+        return self._contents is not None and self._contents.scene == scene
 
     def _clear(self) -> None:
         """Empty the page; set the theme, the panel's place and the light."""
@@ -172,7 +172,7 @@ class Page:
         scene.configure_environment_map(None)
         scene.set_up_direction("+z")
 
-    def _build(self, scene: Scene) -> _Shown:
+    def _build(self, scene: Scene) -> _PageContents:
         """Replace what is shown by a scene: picture, numbers, plots and controls."""
         self._clear()
         self._state = None
@@ -193,7 +193,7 @@ class Page:
         with gui.add_folder("status of the run", order=6.0):
             status = gui.add_html("")
         self._place_cameras(scene)
-        return _Shown(
+        return _PageContents(
             scene=scene,
             drawing=drawing,
             show_controls=show_controls,
@@ -216,28 +216,28 @@ class Page:
             camera.look_at = 0.28 * size * middle
             camera.fov = np.radians(35.0)
 
-    def _update(self, shown: _Shown, frame: int) -> None:
+    def _update(self, contents: _PageContents, frame: int) -> None:
         """Take what is new, and show it where it is due."""
         for state in self._source.states():
-            shown.drawing.add(state.time, state.angles)
+            contents.drawing.add(state.time, state.angles)
             self._add_to_plots(state)
             self._state = state
         if self._state is not None:
-            shown.drawing.show(self._state.angles, self._state.torque)
+            contents.drawing.show(self._state.angles, self._state.torque)
         if frame % _SHOW_EVERY == 0:
-            self._show_numbers(shown)
+            self._show_numbers(contents)
         if frame % _DRAW_EVERY == 0 and len(self._samples) >= 2:
-            self._draw_plots(shown)
+            self._draw_plots(contents)
 
-    def _draw_plots(self, shown: _Shown) -> None:
+    def _draw_plots(self, contents: _PageContents) -> None:
         """Show the samples of the last ten seconds."""
         begin = self._samples[-1].time - _WINDOW_S
         samples = [sample for sample in self._samples if sample.time > begin]
         times = np.array([sample.time for sample in samples])
         degrees = np.array([sample.degrees for sample in samples])
         torques = np.array([sample.torque for sample in samples])
-        shown.angle_plot.data = (times, *degrees.T.copy())
-        shown.torque_plot.data = (times, *torques.T.copy())
+        contents.angle_plot.data = (times, *degrees.T.copy())
+        contents.torque_plot.data = (times, *torques.T.copy())
 
     def _add_to_plots(self, state: ViewState) -> None:
         """Add a state to the plots; a time that goes back begins new ones."""
@@ -250,7 +250,7 @@ class Page:
             degrees = np.degrees(state.gamma)
             self._samples.append(_PlotSample(state.time, degrees, state.torque))
 
-    def _show_numbers(self, shown: _Shown) -> None:
+    def _show_numbers(self, contents: _PageContents) -> None:
         """Show name, phase, time, numbers of the state, and what is possible now."""
         state = self._state
         status = self._source.status()
@@ -258,13 +258,13 @@ class Page:
         time = None if state is None else state.time
         time_text = "–" if time is None else f"{time:.2f} s"
         level = 2 if phase.startswith("fault") else status.level
-        head = _PANEL.head(shown.scene, phase, _LEVELS[level], time_text)
-        shown.head.content = str(head)
+        head = _PANEL.head(contents.scene, phase, _LEVELS[level], time_text)
+        contents.head.content = str(head)
         if state is not None:
-            shown.joints.content = str(_PANEL.joints(_COLOURS, state))
+            contents.joints.content = str(_PANEL.joints(_COLOURS, state))
             panel = _PANEL.status(_LEVELS[status.level], status.message, status.values)
-            shown.status.content = str(panel)
-        shown.show_controls(phase, time)
+            contents.status.content = str(panel)
+        contents.show_controls(phase, time)
 
 
 def _plot(
