@@ -114,7 +114,7 @@ class _LinkTag(NamedTuple):
 
     begins: bool
     link: str
-    joint: Joint | None  # by which it hangs on the element around it, where it begins
+    joint: Joint | None  # to the link around it, where the element begins
 
 
 def _nest(joints: dict[str, Joint]) -> Iterator[_LinkTag]:

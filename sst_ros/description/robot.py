@@ -65,7 +65,7 @@ LEG_COLOURS: tuple[Colour, ...] = (
     (0.84, 0.37, 0.00),
     (0.00, 0.62, 0.45),
 )
-"""Colours of legs 1 to 3, which the colour-blind can tell apart (Okabe and Ito)."""
+"""Colours of legs 1 to 3, distinct also with colour blindness (Okabe and Ito)."""
 
 LEAST_MASS = 1e-10
 """Least mass [kg], and least moment of inertia [kg m^2], that MuJoCo gives a link."""
