@@ -278,6 +278,11 @@ def _nearest_form(angles: Array, reference: Array) -> Array:
     return np.asarray(forms[np.argmin(distances)])
 
 
+def star_direction(rotation: Array) -> Array:
+    """Return s, the direction of E in {B}: the third column of R, shape (..., 3)."""
+    return rotation[..., :, 2]
+
+
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
     """Angle of the rotation between quaternions [rad], shape (...,); exact if tiny."""
     a = np.asarray(first)

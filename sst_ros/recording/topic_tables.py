@@ -33,12 +33,11 @@ from sst_ros.recording.bag_reader import (
     Bag,
     Topic,
 )
-from sst_ros.scene.loads import JOINTS, MOMENTS
+from sst_ros.scene.loads import ACTUATED_JOINTS, JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
 LEG_NUMBERS = (1, 2, 3)
 JOINT_KINDS = ("gamma", "mu", "beta")
-ACTUATED_JOINTS = tuple(name for name in JOINTS if name.startswith("gamma"))
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
