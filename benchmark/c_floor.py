@@ -141,7 +141,7 @@ def compile_step(text: str, folder: Path, name: str, *flags: str) -> ctypes.CDLL
 
 def _function(name: str, program: Program) -> str:
     """C function of a program: from an array of inputs to one of results."""
-    lines, _, results = program.split(())
+    lines, results = program.lines()
     text = [f"static void {name}(const double *restrict in_, double *restrict out_) {{"]
     text += [f"const double {one} = in_[{i}];" for i, one in enumerate(program.inputs)]
     text += [*map(_statement, lines), *_stores(results, "out_[{}]"), "}"]

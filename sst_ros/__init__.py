@@ -60,8 +60,10 @@ if TYPE_CHECKING:
     from sst_ros.sweeps.sweep import sweep as sweep
     from sst_ros.version import VERSION
 
-    direct_kinematics, inverse_kinematics = _kinematics.direct, _kinematics.inverse
-    load_scene, read_bag = _scene.scene_of, _recording.read
+    direct_kinematics = _kinematics.direct
+    inverse_kinematics = _kinematics.inverse
+    load_scene = _scene.scene_of
+    read_bag = _recording.read
     __version__ = VERSION
 
 # Names of each module; one that has another name there is followed by it.

@@ -86,11 +86,9 @@ def _record(
         with _node("simulator", _DEMO_END_S, sync="lockstep", **run):
             # One line when it receives all topics, none where it gives up, or is stuck.
             output = recorder.stdout
-            if not (
-                output
-                and select.select([output], [], [], 2.0 * _READY_S)[0]
-                and output.readline()
-            ):
+            assert output is not None  # a pipe
+            readable, _, _ = select.select([output], [], [], 2.0 * _READY_S)
+            if not readable or not output.readline():
                 text = (
                     "the recorder received nothing from a simulator within"
                     f" {_READY_S:g} s"

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sst_ros.removed import REMOVED_ARGUMENTS
-from sst_ros.state import Array, NotNumbers, TimesLike, real_numbers
+from sst_ros.state import Array, NotNumbers, TimesLike, cached_property, real_numbers
 
 SHOWN_PROBLEMS = 20  # of one input in a message; `InputError.problems` has all of them
 SHOWN_CHARACTERS = 80  # of a value in a message
@@ -56,11 +56,12 @@ class Problem:
 
     def _value_text(self) -> str:
         """Return the value as text, shortened in the middle."""
-        text = f"{type(self.value).__name__} without a text"
-        if isinstance(self.value, int) and self.value:  # of 5,000 digits has no text
-            text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
-        with contextlib.suppress(Exception):
+        try:
             text = repr(self.value)
+        except Exception:  # of an object of the user
+            text = f"{type(self.value).__name__} without a text"
+            if isinstance(self.value, int) and self.value:  # of 5,000 digits has none
+                text = f"an integer of {int(math.log10(abs(self.value))) + 1} digits"
         is_path = isinstance(self.value, str) and os.sep in text
         longest = LONGEST_PATH if is_path else SHOWN_CHARACTERS
         if len(text) <= longest:
@@ -114,7 +115,7 @@ def refuse_other_rounding(origin: str) -> None:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of argument: whether a value is of it, and the words of a refusal."""
+    """A kind of argument: what accepts a value, and the words of a refusal."""
 
     accepts: Callable[[Any], Any]
     requirement: str
@@ -226,9 +227,47 @@ _FAILURES = (
     ArithmeticError,
     MemoryError,
 )
-"""Of a function that was given something else."""
+"""Errors of a function that was given an argument of another kind."""
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _ArgumentCheck:
+    """What the annotations of a function say of its arguments."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._names = list(inspect.signature(function).parameters)
+        qualified_name = function.__qualname__.removesuffix(".__init__")
+        _, _, last_name = qualified_name.rpartition(".")  # a class's, of its __init__
+        self._origin = last_name.lower()
+
+    @cached_property
+    def _kinds(self) -> dict[str, tuple[Kind | None, bool]]:
+        """The kind of each argument, and whether it may be None."""
+        hints = inspect.get_annotations(self._function, eval_str=True)
+        return {
+            name: (_kind_of(hint), NoneType in get_args(hint))
+            for name, hint in hints.items()
+        }
+
+    def _find_fault(self, name: str, value: Any) -> str:
+        """Return why an argument is refused; "" if it is not."""
+        if name not in self._names and name in REMOVED_ARGUMENTS:
+            return REMOVED_ARGUMENTS[name]
+        kind, optional = self._kinds.get(name, (None, False))
+        if kind is None or (optional and value is None):
+            return ""
+        return kind.find_fault(value)
+
+    def check(self, args: tuple[Any, ...], options: dict[str, Any]) -> None:
+        """Raise InputError with each argument of another kind."""
+        problems = []
+        for name, value in [*zip(self._names, args, strict=False), *options.items()]:
+            if fault := self._find_fault(name, value):
+                problems.append(Problem(name, value, fault))
+        if problems:
+            raise InputError(self._origin, problems)
 
 
 def check_kinds(function: F, *, late: bool = False) -> F:
@@ -237,43 +276,17 @@ def check_kinds(function: F, *, late: bool = False) -> F:
     Annotations are those of `_ARGUMENT_KINDS`, and classes, with or without `| None`.
     What else an argument must be is checked by the function itself.
     """
-    names = list(inspect.signature(function).parameters)
-    origin = function.__qualname__.removesuffix(".__init__").rpartition(".")[2].lower()
-
-    @functools.cache
-    def kinds() -> dict[str, tuple[Kind | None, bool]]:
-        """Return the kind of each argument, and whether it may be None."""
-        hints = inspect.get_annotations(function, eval_str=True)
-        return {
-            name: (_kind_of(hint), NoneType in get_args(hint))
-            for name, hint in hints.items()
-        }
-
-    def find_fault(name: str, value: Any) -> str:
-        if name not in names and name in REMOVED_ARGUMENTS:
-            return REMOVED_ARGUMENTS[name]
-        kind, optional = kinds().get(name, (None, False))
-        if kind is None or (optional and value is None):
-            return ""
-        return kind.find_fault(value)
-
-    def check(args: tuple[Any, ...], options: dict[str, Any]) -> None:
-        problems = []
-        for name, value in [*zip(names, args, strict=False), *options.items()]:
-            if fault := find_fault(name, value):
-                problems.append(Problem(name, value, fault))
-        if problems:
-            raise InputError(origin, problems)
+    arguments = _ArgumentCheck(function)
 
     @functools.wraps(function)
     def call(*args: Any, **options: Any) -> Any:
         if not late:
-            check(args, options)
+            arguments.check(args, options)
             return function(*args, **options)
         try:
             return function(*args, **options)
         except _FAILURES:
-            check(args, options)
+            arguments.check(args, options)
             raise
 
     return cast("F", call)

@@ -187,9 +187,10 @@ def legend(axes: Axes, **options: Any) -> None:
 def mark_ends(axes: Axes, *path: Array) -> None:
     """Mark the first and the last finite point of a path, shape (n,) a coordinate."""
     finite = np.flatnonzero(np.isfinite(path[0]))
-    ends = (finite[:1], "o", GREEN, "start"), (finite[-1:], "s", VERMILION, "end")
-    for index, marker, colour, name in ends:
-        place = [coordinate[index] for coordinate in path]
+    start = (finite[:1], "o", GREEN, "start")
+    end = (finite[-1:], "s", VERMILION, "end")
+    for rows, marker, colour, name in (start, end):
+        place = [coordinate[rows] for coordinate in path]
         axes.plot(
             *place, marker, color=colour, markersize=6, label=name, linestyle="none"
         )

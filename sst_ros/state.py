@@ -164,14 +164,16 @@ def _read_objects(objects: NDArray[Any], seconds: bool) -> Array:
     The shape remains.
     """
     numbers = []
-    for each in objects.flat:
-        if isinstance(each, (str, bytes, bytearray, bool, np.bool_)):
+    for entry in objects.flat:
+        if isinstance(entry, (str, bytes, bytearray, bool, np.bool_)):
             raise NotNumbers("must be numbers")
-        if reason := find_lost_meaning(each, seconds=seconds):
+        if reason := find_lost_meaning(entry, seconds=seconds):
             raise LostMeaning(reason)
         try:
-            is_duration = isinstance(each, timedelta)
-            numbers.append(each.total_seconds() if is_duration else float(each))
+            if isinstance(entry, timedelta):
+                numbers.append(entry.total_seconds())
+            else:
+                numbers.append(float(entry))
         except (TypeError, ValueError, OverflowError, ArithmeticError):
             raise NotNumbers("must be numbers") from None
     return np.array(numbers, dtype=float).reshape(objects.shape)
@@ -180,7 +182,7 @@ def _read_objects(objects: NDArray[Any], seconds: bool) -> Array:
 def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> str:
     """Say what a conversion to doubles would drop, "" if nothing.
 
-    `seconds` keeps durations.
+    With `seconds` durations are no loss. `depth` counts the lists around the value.
     """
     if type(value) in (float, int):
         return ""
@@ -188,7 +190,9 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
         if depth == _DEEPEST_LIST:
             return "must be numbers, in rows of equal length"
         entry_types = set(map(type, value))
-        suspects = tuple(each for each in entry_types if not _is_plain(each))
+        suspects = tuple(
+            entry_type for entry_type in entry_types if not _is_plain(entry_type)
+        )
         if not suspects:
             return ""
         for entry in value:
@@ -205,7 +209,7 @@ def find_lost_meaning(value: Any, *, seconds: bool = False, depth: int = 0) -> s
     if dtype_kind == "c" or isinstance(value, complex):
         return "must be real numbers, not complex ones"
     if dtype_kind == "m":
-        time_unit = np.datetime_data(np.asarray(value).dtype)[0]
+        time_unit, _ = np.datetime_data(np.asarray(value).dtype)
         # Years and months have no length.
         has_length = time_unit not in ("generic", "Y", "M")
         return "" if seconds and has_length else "must be numbers, no durations"
@@ -239,7 +243,7 @@ def clamp(torque: Vector3, limit: float | None) -> Vector3:
     """Clamp torques [N m] to the limit of the actuators, where they have one."""
     if limit is None:
         return torque
-    first, second, third = (min(max(each, -limit), limit) for each in torque)
+    first, second, third = (min(max(tau, -limit), limit) for tau in torque)
     return first, second, third
 
 
@@ -292,10 +296,7 @@ class Explained:
 
 
 def _say(value: object) -> str:
-    """Write a value on one line.
-
-    Numbers have six digits, several are in brackets, and "none" stands for none.
-    """
+    """Write a value on one line: floats with six digits, several in brackets."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, (tuple, list, np.ndarray)):
@@ -341,13 +342,23 @@ class State(Explained):
     ) -> State:
         """Collect a state.
 
-        Quaternion and body rate begin y, 18 angles and rates are the joints.
+        y begins with quaternion and body rate; `joints` are 18 angles and rates.
         """
-        j: Any = joints if type(joints) is tuple else tuple(joints)
-        by_kind = Joints(j[0:3], j[3:6], j[6:9], j[9:12], j[12:15], j[15:18])
-        return cls(
-            time_ns, (y[0], y[1], y[2], y[3]), (y[4], y[5], y[6]), by_kind, torque
+        qx, qy, qz, qw, wx, wy, wz, *_ = y
+        (
+            gamma_1, gamma_2, gamma_3, mu_1, mu_2, mu_3, beta_1, beta_2, beta_3,
+            gamma_dot_1, gamma_dot_2, gamma_dot_3, mu_dot_1, mu_dot_2, mu_dot_3,
+            beta_dot_1, beta_dot_2, beta_dot_3,
+        ) = joints  # fmt: skip
+        by_kind = Joints(
+            (gamma_1, gamma_2, gamma_3),
+            (mu_1, mu_2, mu_3),
+            (beta_1, beta_2, beta_3),
+            (gamma_dot_1, gamma_dot_2, gamma_dot_3),
+            (mu_dot_1, mu_dot_2, mu_dot_3),
+            (beta_dot_1, beta_dot_2, beta_dot_3),
         )
+        return cls(time_ns, (qx, qy, qz, qw), (wx, wy, wz), by_kind, torque)
 
     def _facts(self) -> dict[str, object]:
         return {

@@ -23,8 +23,8 @@ from rclpy.duration import Duration
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from sst_ros.runtime.child_process import keep_domain, run_beside
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene import scene
+from sst_ros.scene.loads import ACTUATED_JOINTS
 
 AHEAD_S, ROUND_S = 1.0, 8.0  # time of the point from now, and of a round of the path
 AMPLITUDES = (0.1, 0.05, 0.02)  # [rad]

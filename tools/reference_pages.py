@@ -84,10 +84,9 @@ def commands_tables() -> Iterator[tuple[str, str]]:
             arguments_of = (
                 _table(("argument", "what"), rows) if rows else "No arguments.\n"
             )
-            text += (
-                f"## {name}\n\n{entry.what[:1].upper()}{entry.what[1:]}.\n\n"
-                f"{arguments_of}\n"
-            )
+            first_letter = entry.description[:1].upper()
+            sentence = f"{first_letter}{entry.description[1:]}."
+            text += f"## {name}\n\n{sentence}\n\n{arguments_of}\n"
     yield "commands", text
 
 

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `sst-ros`: its table of commands, and how one runs.
 
-Errors become an exit status.
-
 A function is named, not imported: its module, with the rooms and libraries that it
 uses, is imported when its command runs, so that `sst-ros --help` imports none of them.
+Errors become an exit status.
 """
 
 from __future__ import annotations
@@ -33,6 +32,11 @@ from sst_ros.removed import REMOVED_COMMANDS
 from sst_ros.version import VERSION
 
 PROGRAM = "sst-ros"
+_REFUSED_WORD = re.compile(
+    r"invalid choice: '(?P<choice>[^']*)'"
+    r"|unrecognized arguments: (?P<option>[^\s=]+)"
+)
+"""The word that an error of argparse refuses; of --option=value the option."""
 _BAG_SUFFIXES = (".mcap", ".db3")
 
 
@@ -48,20 +52,25 @@ class Arg:
 
 
 class Subcommand:
-    """A command: its line of help, `module:function` that runs it, its arguments.
+    """A command.
 
-    Optional modules that it `needs` are looked for before the module that runs it is
-    imported; its page of help says `more`.
+    Attributes:
+        description: its line of help.
+        run: `module:function` that runs it.
+        arguments: its arguments.
+        needs: optional modules that are looked for before that of `run` is imported.
+        details: what its page of help says in place of the description.
+
     """
 
     def __init__(
         self, description: str, run: str, *args: Arg, needs: str = "", details: str = ""
     ) -> None:
-        self.what = description
+        self.description = description
         self.run = run
         self.arguments = args
         self.needs = needs.split()
-        self.more = details
+        self.details = details
 
 
 def _number_of(convert: Callable[[str], Any], text: str) -> Any:
@@ -80,8 +89,7 @@ _flag = partial(Arg, action="store_true")
 _path = partial(Arg, type=Path)
 _number = partial(Arg, type=partial(_number_of, float))
 _whole_number = partial(Arg, type=partial(_number_of, int))
-# which shells complete by argcomplete
-_scene = partial(Arg, completer="scene.scene:names")
+_scene = partial(Arg, completer="scene.scene:names")  # shells complete it
 
 
 def _output_options(description: str, default: str) -> tuple[Arg, Arg]:
@@ -489,16 +497,14 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the usage, the error and the nearest name; exit with status 2."""
         hint = ""
-        if wrong := re.search(
-            r"invalid choice: '([^']*)'|unrecognized arguments: (\S+)", message
-        ):
-            options = [
-                str(choice)
-                for action in self._actions
-                for choice in action.choices or ()
-            ]
-            options += self._option_string_actions
-            hint = suggestion(wrong[1] or wrong[2].partition("=")[0], options)
+        refused = _REFUSED_WORD.search(message)
+        if refused is not None:
+            known: list[str] = []
+            for action in self._actions:
+                known += [str(choice) for choice in action.choices or ()]
+            known += self._option_string_actions
+            word = refused["choice"] or refused["option"]
+            hint = suggestion(word, known)
         super().error(printable(message) + hint)
 
 
@@ -533,19 +539,21 @@ def parser() -> Parser:
             )
             continue
         command = groups[group].add_parser(
-            last, help=entry.what, description=entry.more or None
+            last, help=entry.description, description=entry.details or None
         )
         command.set_defaults(entry=entry)
         for argument in entry.arguments:
             action: Any = command.add_argument(argument.name, **argument.options)
             if argument.completer:
-                # A default binds the name of this turn of the loop.
-                action.completer = lambda names=argument.completer, **_: function(
-                    names
-                )()
+                action.completer = partial(_complete, argument.completer)
     for name, description in NODE_HELP.items():
         groups[""].add_parser(name, help=description, add_help=False)
     return result
+
+
+def _complete(name: str, **_: Any) -> Any:
+    """Return the words that complete an argument, by the function that yields them."""
+    return function(name)()
 
 
 def function(name: str) -> Any:
@@ -555,7 +563,7 @@ def function(name: str) -> Any:
 
 
 def results_folder(bag: Path, purpose: str) -> Path:
-    """Return the default folder of the results of a recording, beside it: BAG_kind."""
+    """Return the default folder of results of a recording: BAG_PURPOSE, beside it."""
     path = bag.resolve() if bag.name in ("", "..") else bag
     name = path.stem if path.suffix in _BAG_SUFFIXES else path.name
     return path.with_name(f"{name}_{purpose}")

@@ -48,8 +48,7 @@ def check_plan(options: argparse.Namespace) -> int:
     if options.csv is not None:
         require_free(options.csv, "plan check", force=options.force, option="--csv")
     scene = load(options.scene)
-    of_bag = "recording.recording:read_run_motion"  # its module needs rosbags
-    motion = reference_motion(scene, lambda bag, name: function(of_bag)(bag, name))
+    motion = reference_motion(scene, _read_run_motion)
     plan = examine_motion(motion, scene)
     speeds = time_scaling(plan)
     if options.json:
@@ -59,6 +58,11 @@ def check_plan(options: argparse.Namespace) -> int:
     if options.csv is not None:
         write_torques(plan, options.csv, options.period)
     return 1 if plan.problems else 0
+
+
+def _read_run_motion(bag: str, namespace: str | None) -> Any:
+    """Read the motion of a recorded run; the module needs rosbags."""
+    return function("recording.recording:read_run_motion")(bag, namespace)
 
 
 def plan_text(plan: MotionPlan, speeds: TimeScaling) -> str:
@@ -93,9 +97,10 @@ def find_plan_findings(plan: MotionPlan) -> list[Finding]:
 def describe_speeds(plan: MotionPlan, speeds: TimeScaling) -> list[str]:
     """Say at which speeds a plan is feasible, and which limit ends them."""
     statements = []
-    held_limits = [distance for distance in plan.distances if distance.refused]
-    least = min((distance.least for distance in held_limits), default=math.inf)
-    if least < 0.0:
+    leaves_limits = any(
+        distance.refused and distance.least < 0.0 for distance in plan.distances
+    )
+    if leaves_limits:
         statements.append("At no speed: the path itself leaves what is allowed.")
     elif speeds.highest is None:
         statements.append("At no speed: the torque limit is too small for this path.")
@@ -118,17 +123,7 @@ def describe_speeds(plan: MotionPlan, speeds: TimeScaling) -> list[str]:
 def run_sweep(options: argparse.Namespace) -> None:
     """Run a study of many runs, or draw the results of one."""
     if str(options.study) == PLOT:
-        if (
-            options.folder is None
-            or options.scheduler
-            or options.workers
-            or options.resume
-        ):
-            options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
-        # a sweep needs no Matplotlib
-        draw = function("sweeps.sweep_pictures:draw_pictures")
-        for path in draw(read_sweep(options.folder), options.out or options.folder):
-            print(path)
+        _plot_sweep(options)
         return
     if options.folder is not None:
         options.parser.error("DIR is an argument of `sweep plot`; give --out DIR")
@@ -155,6 +150,15 @@ def run_sweep(options: argparse.Namespace) -> None:
     print(f"Results in {folder}; `sst-ros sweep plot {folder}` draws them.")
 
 
+def _plot_sweep(options: argparse.Namespace) -> None:
+    """Draw the results of a study."""
+    if options.folder is None or options.scheduler or options.workers or options.resume:
+        options.parser.error("usage: sst-ros sweep plot DIR [--out DIR]")
+    draw = function("sweeps.sweep_pictures:draw_pictures")  # needs Matplotlib
+    for path in draw(read_sweep(options.folder), options.out or options.folder):
+        print(path)
+
+
 def run_identification(options: argparse.Namespace) -> None:
     """Identify a scene from a recorded run, or design a motion for that.
 
@@ -162,12 +166,12 @@ def run_identification(options: argparse.Namespace) -> None:
     """
     designing = options.bag == DESIGN
     if designing:
-        chosen = _given_options(options, DESIGN_OPTIONS)
-        foreign = _given_options(options, RECORDED_OPTIONS)
+        chosen = _set_options(options, DESIGN_OPTIONS)
+        foreign = _set_options(options, RECORDED_OPTIONS)
         requirement = f"is no option of identify {DESIGN}"
     else:
-        chosen = _given_options(options, RECORDED_OPTIONS)
-        foreign = _given_options(options, DESIGN_OPTIONS)
+        chosen = _set_options(options, RECORDED_OPTIONS)
+        foreign = _set_options(options, DESIGN_OPTIONS)
         requirement = "is no option of identify BAG"
     checks: list[Check] = []
     for name, value in foreign.items():
@@ -192,7 +196,7 @@ def run_identification(options: argparse.Namespace) -> None:
         print(f"wrote {options.out}")
 
 
-def _given_options(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """Return those of some options that are given, by their names."""
+def _set_options(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """Return those of some options that the command line sets, by their names."""
     values = {name: getattr(options, name) for name in names}
     return {name: value for name, value in values.items() if value is not None}

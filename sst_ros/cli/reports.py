@@ -19,9 +19,9 @@ from sst_ros.scene.scene import load, names
 def report_run(options: argparse.Namespace) -> None:
     """Evaluate a recorded run."""
     folder = free_out(options, results_folder(options.bag, "report"))
-    choices = {"damaged": options.damaged, "namespace": options.namespace}
-    summary = function("report.run_page:write_run_report")(
-        options.bag, folder, **choices
+    write = function("report.run_page:write_run_report")
+    summary = write(
+        options.bag, folder, damaged=options.damaged, namespace=options.namespace
     )
     if options.verbose:
         print(function("report.run:summary_table")(summary))
@@ -102,27 +102,30 @@ def _tell(paths: list[Path], missing: dict[str, str]) -> int:
     """Print which pictures were drawn, and which not; return the exit status."""
     for path in paths:
         print(path)
-    for name, why in missing.items():
-        print(f"{name}: {why}")
+    for name, reason in missing.items():
+        print(f"{name}: {reason}")
     return 0 if paths else 1
+
+
+def _demonstrate_control(options: argparse.Namespace) -> None:
+    """Have the controller follow a motion in each mode; evaluate each run."""
+    target = free_out(options, "demo_out/feedforward")
+    name = options.scene or demo.FOLLOWED
+    write = function("report.tracking:write_tracking_report")
+    for mode in options.mode or demo.DEMO_MODES:
+        print(f"{name}, {mode}: {load(name).description}", flush=True)
+        bag = demo.follow(name, target / mode, mode)
+        print(write(bag, target / mode), flush=True)
 
 
 def run_demo(options: argparse.Namespace) -> None:
     """Run the paper's examples by the nodes, or follow a motion; evaluate each run."""
-    following = options.kind == "feedforward"
-    if not following and (options.scene or options.mode):
-        options.parser.error("--scene and --mode are options of `demo feedforward`")
-    target = free_out(options, "demo_out/feedforward" if following else "demo_out")
-    if following:
-        name = options.scene or demo.FOLLOWED
-        for mode in options.mode or demo.DEMO_MODES:
-            print(f"{name}, {mode}: {load(name).description}", flush=True)
-            bag = demo.follow(name, target / mode, mode)
-            print(
-                function("report.tracking:write_tracking_report")(bag, target / mode),
-                flush=True,
-            )
+    if options.kind == "feedforward":
+        _demonstrate_control(options)
         return
+    if options.scene or options.mode:
+        options.parser.error("--scene and --mode are options of `demo feedforward`")
+    target = free_out(options, "demo_out")
     for name in demo.EXAMPLES:
         folder = target if name == "example2" else target / name  # the main job
         print(f"{name}: {load(name).description}", flush=True)

@@ -44,6 +44,7 @@ from sst_ros.view.source import Replay, run_simulator
 
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 INERTIA_ROUNDING = 1e-6  # relative, of inertias that a person has typed
+DEFAULT_CONTROL_PERIOD = 1e-3  # of `certify --control` [s]
 
 
 def show(options: argparse.Namespace) -> None:
@@ -84,25 +85,28 @@ def check(name_or_path: str | Path) -> Scene:
         problems = [
             Problem("initial.gamma", scene.initial.gamma, f"cannot start here: {error}")
         ]
-    placed = [dataclasses.replace(p, line=line_of(source, p.key)) for p in problems]
-    raise InputError(origin, placed)
+    with_lines = []
+    for problem in problems:
+        line = line_of(source, problem.key)
+        with_lines.append(dataclasses.replace(problem, line=line))
+    raise InputError(origin, with_lines)
 
 
 def implausible(scene: Scene) -> str:
-    """Describe numbers of the star that no body can have though each is allowed.
+    """Describe numbers of the star that no body can have, though each is allowed.
 
-    "" for none.
+    The description is empty where a body can have them.
     """
     star = scene.star
     # A body of mass m within the distance r of O has trace(I) <= 2 m r^2 about O.
     trace = float(star.inertia.matrix.trace())
-    most = 2.0 * star.mass * star.radius**2
-    if star.mass == 0.0 or trace <= most * (1.0 + INERTIA_ROUNDING):
+    largest_trace = 2.0 * star.mass * star.radius**2
+    if star.mass == 0.0 or trace <= largest_trace * (1.0 + INERTIA_ROUNDING):
         return ""
     return (
         f"star.inertia: its trace is {trace:g} kg m^2; a body of star.mass ="
         f" {star.mass:g} kg within star.radius = {star.radius:g} m has at most 2 m r^2"
-        f" = {most:g} kg m^2"
+        f" = {largest_trace:g} kg m^2"
     )
 
 
@@ -187,23 +191,23 @@ def certify_scene(options: argparse.Namespace) -> int:
     choices |= {"ranges": ranges, "split": options.split or 1, "progress": True}
     scene = load(options.scene)
     torque = None
-    loop_options = (
-        options.gain,
-        options.noise,
-        options.control_period,
-        options.tracking,
-    )
     if options.control is not None:
-        period = 1e-3 if options.control_period is None else options.control_period
+        period = options.control_period
+        if period is None:
+            period = DEFAULT_CONTROL_PERIOD
         torque = _controller(scene, options, period)
-        choices |= {
-            "control_period": period,
-            "noise": tuple(options.noise or (0.0, 0.0)),
-        }
+        noise = tuple(options.noise or (0.0, 0.0))
+        choices |= {"control_period": period, "noise": noise}
     else:
+        names = "--gain, --noise, --control-period, --tracking"
+        loop_options = (
+            options.gain,
+            options.noise,
+            options.control_period,
+            options.tracking,
+        )
         requirement = "are given with --control"
         is_free = not any(loop_options)
-        names = "--gain, --noise, --control-period, --tracking"
         refuse_unless("certify", (names, loop_options, is_free, requirement))
     proven = function("proof.certify:certify")(scene, torque, **choices)
     print(proven)
@@ -255,7 +259,7 @@ def _write_in_full(table: Any, path: Path) -> None:
 
 def _zone_limits(options: argparse.Namespace) -> dict[str, Any]:
     """Return the cap or the box of a zone, in radians."""
-    half_turn = 180.0
+    half_turn = 180.0  # the default of --torsion
     if options.gamma_box is not None:
         box = np.radians(options.gamma_box).reshape(3, 2)
         is_alone = options.tilt is None and options.torsion == half_turn
@@ -263,7 +267,9 @@ def _zone_limits(options: argparse.Namespace) -> dict[str, Any]:
         requirement = "are those of a cap: leave them out with --gamma-box"
         refuse_unless("zone", ("--tilt, --torsion", cap_limits, is_alone, requirement))
         return {"gamma_box": box}
-    torsion = math.pi if options.torsion == half_turn else math.radians(options.torsion)
+    torsion = math.radians(options.torsion)
+    if options.torsion == half_turn:
+        torsion = math.pi
     tilt = None if options.tilt is None else math.radians(options.tilt)
     return {"tilt": tilt, "torsion": torsion}
 
@@ -289,8 +295,9 @@ def read_range(text: str) -> tuple[str, object]:
     is_read = bool(key) and all(NUMBER.fullmatch(number) for number in numbers)
     requirement = "must be KEY=HALF_WIDTH, KEY=LOW..HIGH or KEY=digits"
     refuse_unless("certify", ("--range", text, is_read, requirement))
-    floats = tuple(map(float, numbers))
-    return key, floats if dots else floats[0]
+    if dots:
+        return key, (float(low), float(high))
+    return key, float(width)
 
 
 def _controller(scene: Scene, options: argparse.Namespace, period: float) -> object:
@@ -312,19 +319,7 @@ def _controller(scene: Scene, options: argparse.Namespace, period: float) -> obj
 def view(options: argparse.Namespace) -> int:
     """Serve the page of a bag, of a running simulator, or of one started for it."""
     if options.bag is not None:
-        single_scene = options.scene is None
-        refuse_unless(
-            "view",
-            ("--scene", options.scene, single_scene, "give a bag or a scene, not both"),
-        )
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)
-        with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as end:
-            replay = Replay(options.bag, options.namespace)
-            page = function("view.page:Page")(replay, options.host, options.port)
-            end.callback(page.close)
-            page.announce(opened=options.open)
-            threading.Event().wait()
+        _view_recording(options)
         return 0
     require("rclpy")
     if options.scene is not None:
@@ -333,11 +328,28 @@ def view(options: argparse.Namespace) -> int:
         name: getattr(options, name) for name in ("simulator", "host", "port", "open")
     }
     ros_arguments = ["viewer", "--ros-args", "-r", f"__ns:={options.namespace or '/'}"]
-    with run_simulator(options.scene) if options.scene else contextlib.nullcontext():
+    with contextlib.ExitStack() as end:
+        if options.scene:
+            end.enter_context(run_simulator(options.scene))
         status: int = function("nodes.process:run")(
             [*ros_arguments, *child_process.words(parameters)]
         )
     return status
+
+
+def _view_recording(options: argparse.Namespace) -> None:
+    """Serve the page of a bag until a signal comes."""
+    is_alone = options.scene is None
+    requirement = "give a bag or a scene, not both"
+    refuse_unless("view", ("--scene", options.scene, is_alone, requirement))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as end:
+        replay = Replay(options.bag, options.namespace)
+        page = function("view.page:Page")(replay, options.host, options.port)
+        end.callback(page.close)
+        page.announce(opened=options.open)
+        threading.Event().wait()
 
 
 def write_equations(options: argparse.Namespace) -> None:

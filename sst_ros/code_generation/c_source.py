@@ -14,13 +14,14 @@ import re
 from collections.abc import Iterator
 
 from sst_ros.code_generation.named_programs import (
+    INFIX,
     Argument,
     NamedProgram,
     SceneEquations,
+    write_steps,
 )
-from sst_ros.programs.expression import Program, tanh_program
+from sst_ros.programs.expression import Program, references, tanh_program
 
-INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 PATTERNS = {
     "neg": "-{}",
     "positive": "0.0 > {0} ? 0.0 : {0}",
@@ -43,9 +44,8 @@ NO_FUSION = """\
 
 def identifier(equations: SceneEquations) -> str:
     """Return the name of the scene as an identifier of C and a name of files."""
-    return re.sub(
-        r"^(?=\d)", "scene_", re.sub(r"\W", "_", equations.scene.name, flags=re.A)
-    )
+    name = re.sub(r"\W", "_", equations.scene.name, flags=re.A)
+    return re.sub(r"^(?=\d)", "scene_", name)
 
 
 def c_files(equations: SceneEquations) -> dict[str, str]:
@@ -128,38 +128,32 @@ def _tanh_function() -> Iterator[str]:
     yield "static double tanh_steps(double x)"
     yield "{"
     yield from _statements(program)
-    yield f"    return v{program.outputs[0] - len(program.inputs)};"
+    (result,) = map(program.operand_writer(), program.outputs)
+    yield f"    return {result};"
     yield "}"
 
 
 def _body(named: NamedProgram) -> Iterator[str]:
     """Write the statements: read arguments, compute, store results."""
     program = named.program
-    used: set[int] = set()
-    for operands in (*(operands for _, operands in program.steps), program.outputs):
-        # A float is a constant, an int the number of an input or a step.
-        used.update(operand for operand in operands if isinstance(operand, int))
+    used = set(references(program.outputs))
+    for _, operands in program.steps:
+        used.update(references(operands))
     first = 0
     for argument in named.arguments:
         indices = [i for i in range(argument.size) if first + i in used]
         yield from _reads(argument, indices)
         first += argument.size
     yield from _statements(program)
-    names = _value_names(program)
+    write = program.operand_writer()
     for i, output in enumerate(program.outputs):
-        yield f"    result[{i}] = {_operand_text(output, names)};"
+        yield f"    result[{i}] = {write(output)};"
 
 
 def _statements(program: Program) -> Iterator[str]:
-    names = _value_names(program)
-    for i, (operation, operands) in enumerate(program.steps):
-        assert isinstance(operation, str)  # equations call no routine
-        expression = _expression(operation, [_operand_text(x, names) for x in operands])
-        yield f"    const double v{i} = {expression};"
-
-
-def _value_names(program: Program) -> list[str]:
-    return [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
+    yield from (
+        f"    const double {line};" for line in write_steps(program, _expression)
+    )
 
 
 def _reads(argument: Argument, used: list[int]) -> Iterator[str]:
@@ -167,13 +161,6 @@ def _reads(argument: Argument, used: list[int]) -> Iterator[str]:
         yield f"    (void){argument.name};"
     for i in used:
         yield f"    const double {argument.symbols[i]} = {argument.name}[{i}];"
-
-
-def _operand_text(operand: float | int, names: list[str]) -> str:
-    if isinstance(operand, int):
-        return names[operand]
-    number = repr(float(operand))
-    return f"({number})" if number.startswith("-") else number
 
 
 def _expression(operation: str, operands: list[str]) -> str:

@@ -56,7 +56,8 @@ class Equations(Explained):
         parameters: Mapping[str, float],
         initial_state: tuple[float, ...],
     ) -> None:
-        self.target, self.files = target, dict(files)
+        self.target = target
+        self.files = dict(files)
         self.outputs = outputs
         self.parameters = dict(parameters)
         self.initial_state = initial_state
@@ -151,9 +152,9 @@ def equations(
         ),
     )
     output_names = None if outputs is None else tuple(outputs)
-    traced = SceneEquations(
-        loaded_scene, tuple(parameters), () if model_target else output_names
-    )
+    if model_target:  # traces what its format asks for by itself
+        output_names = ()
+    traced = SceneEquations(loaded_scene, tuple(parameters), output_names)
     values = dict(zip(traced.parameters, traced.values, strict=True))
     name = identifier(traced)
     if target == MJCF:

@@ -25,7 +25,7 @@ from sst_ros.code_generation.named_programs import SceneEquations
 from sst_ros.errors import SstError
 from sst_ros.files import load_templates
 from sst_ros.integration.methods import DOP853
-from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.loads import JOINTS, MOMENTS
 from sst_ros.version import VERSION
 
 STATES = (
@@ -33,18 +33,17 @@ STATES = (
     *(f"body_rate_{axis}" for axis in "xyz"),
     *(f"actuator_torque_{leg}" for leg in (1, 2, 3)),
 )
-INPUTS = (
-    *(f"torque_{leg}" for leg in (1, 2, 3)),
-    *(f"moment_{axis}" for axis in "xyz"),
-)
+TORQUE_INPUTS = tuple(f"torque_{leg}" for leg in (1, 2, 3))
+MOMENT_INPUTS = MOMENTS
 FMU_OUTPUTS = (
     *JOINTS,
     *(f"{name}_rate" for name in JOINTS),
     "kinetic_energy",
     "potential_energy",
 )
+# of STATES and FMU_OUTPUTS, in their order
 STATE_UNITS = ("1",) * 4 + ("rad/s",) * 3 + ("N.m",) * 3
-OUTPUT_UNITS = ("rad",) * 9 + ("rad/s",) * 9 + ("J",) * 2
+OUTPUT_UNITS = ("rad",) * len(JOINTS) + ("rad/s",) * len(JOINTS) + ("J", "J")
 FMU_UNITS: dict[str, dict[str, int]] = {
     "1": {},
     "rad": {"rad": 1},
@@ -71,12 +70,10 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
         equations.scene, equations.parameters, ("derivative", "joints", "energies")
     )
     templates = load_templates("code_generation")
-    token = str(
-        uuid.uuid5(
-            uuid.NAMESPACE_URL,
-            f"{VERSION} {model.scene_hash} {model.parameters}",
-        )
-    )
+    contents = f"{VERSION} {model.scene_hash} {model.parameters}"
+    token = str(uuid.uuid5(uuid.NAMESPACE_URL, contents))
+    stages = len(DOP853.c)
+    stage_rows = [[*row, *[0.0] * (stages - len(row))] for row in DOP853.a]
     sources = c_files(model)
     sources["fmi3.c"] = templates.get_template("fmi3.c").render(
         name=name,
@@ -85,8 +82,8 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
         inputs=sum(argument.size for argument in model.acting),
         parameters=model.parameters,
         torque_limit=model.scene.torque_limit,
-        stages=len(DOP853.c),
-        stage_rows=[[*row, *(0.0,) * (len(DOP853.c) - len(row))] for row in DOP853.a],
+        stages=stages,
+        stage_rows=stage_rows,
         weights=DOP853.b,
         fifth=DOP853.error,
         third=DOP853.damping,
@@ -119,45 +116,35 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
 def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:
     """Yield the attributes of each variable, in the order of value references."""
     continuous = {"variability": "continuous"}
-    size = equations.state.size
-    rows: list[dict[str, Any]] = [
-        {"name": "time", "causality": "independent", "unit": "s"}
-    ]
-    rows[0] |= continuous
-    for name, unit, start in zip(STATES, STATE_UNITS, equations.initial, strict=False):
-        exact = {"initial": "exact", "start": repr(start)}
-        rows.append(
-            {"name": name, "causality": "output", "unit": unit} | continuous | exact
-        )
-    for i in range(size):
-        derivative = {"initial": "calculated", "derivative": 1 + i}
-        rows.append(
-            {"name": f"der({STATES[i]})", "causality": "local"}
-            | continuous
-            | derivative
-        )
-    for argument, names in zip(
-        equations.acting, (INPUTS[:3], INPUTS[3:]), strict=False
-    ):
-        for name, quantity in zip(names, argument.quantities, strict=True):
-            about = {"causality": "input", "unit": "N.m", "description": quantity}
-            rows.append({"name": name, "start": "0.0"} | about | continuous)
-    for name, unit in zip(FMU_OUTPUTS, OUTPUT_UNITS, strict=True):
-        calculated = {"initial": "calculated", "unit": unit}
-        rows.append({"name": name, "causality": "output"} | continuous | calculated)
     fixed = {"causality": "parameter", "variability": "fixed", "initial": "exact"}
+    rows: list[dict[str, Any]] = []
+    rows.append({"name": "time", "causality": "independent", "unit": "s", **continuous})
+    states = STATES[: equations.state.size]
+    for name, unit, start in zip(states, STATE_UNITS, equations.initial, strict=False):
+        row = {"name": name, "causality": "output", "unit": unit, **continuous}
+        rows.append({**row, "initial": "exact", "start": repr(start)})
+    for reference, name in enumerate(states, start=1):  # time has the reference 0
+        row = {"name": f"der({name})", "causality": "local", **continuous}
+        rows.append({**row, "initial": "calculated", "derivative": reference})
+    inputs = (TORQUE_INPUTS, MOMENT_INPUTS)  # there is a moment if a topic gives it
+    for argument, names in zip(equations.acting, inputs, strict=False):
+        for name, quantity in zip(names, argument.quantities, strict=True):
+            row = {"name": name, "start": "0.0", "causality": "input", "unit": "N.m"}
+            rows.append({**row, "description": quantity, **continuous})
+    for name, unit in zip(FMU_OUTPUTS, OUTPUT_UNITS, strict=True):
+        row = {"name": name, "causality": "output", **continuous}
+        rows.append({**row, "initial": "calculated", "unit": unit})
     quantities = [text for argument in equations.open for text in argument.quantities]
     for name, value, text in zip(
         equations.parameters, equations.values, quantities, strict=True
     ):
-        rows.append({"name": name, "start": repr(value), "description": text} | fixed)
+        rows.append({"name": name, "start": repr(value), "description": text, **fixed})
     text = (
         "Co-Simulation: length of a step [s]; 0 for steps that an error estimate"
         " controls"
     )
-    rows.append(
-        {"name": "step", "start": "0.0", "unit": "s", "description": text} | fixed
-    )
+    row = {"name": "step", "start": "0.0", "unit": "s", "description": text}
+    rows.append({**row, **fixed})
     for reference, row in enumerate(rows):
         yield {"valueReference": reference} | row
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import start_of
-from sst_ros.dynamics.traced_dynamics import ODE, Dynamics
+from sst_ros.dynamics.traced_dynamics import ODE, Dynamics, parameter_symbols
 from sst_ros.dynamics.variational import REBOUND, list_numbers, refuse_other_numbers
 from sst_ros.errors import refusal, suggestion
 from sst_ros.mechanism.geometry import Geometry
@@ -32,14 +32,17 @@ from sst_ros.scene.yaml_document import (
     plain,
     replace_values,
 )
-from sst_ros.state import cached_property
+from sst_ros.state import MOMENT, TORQUES, cached_property
 from sst_ros.version import VERSION
+
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+"""Operators of C and of Python between two operands."""
 
 CALLER = "equations"  # heads the messages of what is refused
 
 # names of the arguments of the equations
 STATE_ARGUMENT = "state"
-TORQUES = "torque"
+TORQUE_ARGUMENT = "torque"
 MOMENT_ARGUMENT = "moment"
 PARAMETERS = "parameters"
 
@@ -72,22 +75,16 @@ class Argument(NamedTuple):
 
 
 class NamedProgram(NamedTuple):
-    """One of the equations: a function of vectors that returns a vector or a matrix."""
+    """One of the equations: a function of vectors that returns a vector or a matrix.
+
+    It calls no routine.
+    """
 
     name: str
     description: str  # the units of what it returns included
     arguments: tuple[Argument, ...]
     shape: tuple[int, ...]
     program: Program  # its inputs are the symbols of the arguments, in order
-
-    @property
-    def steps(self) -> list[tuple[str, tuple[float | int, ...]]]:
-        """The operations of the program by name, with their operands."""
-        steps = []
-        for operation, operands in self.program.steps:
-            assert isinstance(operation, str)  # equations call no routine
-            steps.append((operation, operands))
-        return steps
 
 
 class SceneEquations:
@@ -138,7 +135,8 @@ class SceneEquations:
         AssemblyError or SingularConfiguration is raised where there is none.
         """
         start = start_of(self.scene)
-        return (*start, *(0.0 for _ in self.dynamics.state[len(start) :]))
+        lagged = len(self.dynamics.state) - len(start)
+        return (*start, *[0.0] * lagged)
 
     @property
     def scene_hash(self) -> str:
@@ -158,18 +156,18 @@ class SceneEquations:
         meaning = "command to" if self.scene.lags else "torque of"
         torques = tuple(f"{meaning} actuator {leg} [N m]" for leg in legs)
         symbols = self.dynamics.drive
-        torque = Argument(TORQUES, symbols[:3], torques)
+        torque = Argument(TORQUE_ARGUMENT, symbols[TORQUES], torques)
         if not self.dynamics.has_moment_topic:
             return (torque,)
         moments = tuple(f"moment on the star, {axis} in {{B}} [N m]" for axis in "xyz")
-        return torque, Argument(MOMENT_ARGUMENT, symbols[3:], moments)
+        return torque, Argument(MOMENT_ARGUMENT, symbols[MOMENT], moments)
 
     @property
     def open(self) -> tuple[Argument, ...]:
-        """The parameters as an argument; none where there are none."""
+        """The parameters as an argument; no argument where there are none."""
         if not self.parameters:
             return ()
-        symbols = tuple(f"p{i}" for i in range(len(self.parameters)))
+        symbols = parameter_symbols(len(self.parameters))
         quantities = []
         for key, value in zip(self.parameters, self.values, strict=True):
             unit = _unit_of(self.scene, key)
@@ -238,7 +236,8 @@ def _joints(equations: SceneEquations) -> NamedProgram:
     program = trace(joints, _symbols(arguments))
     angles = ", ".join(JOINTS)
     description = f"angles {angles} [rad], then their rates [rad/s]"
-    return NamedProgram("joints", description, arguments, (18,), program)
+    angles_and_rates = 2 * len(JOINTS)
+    return NamedProgram("joints", description, arguments, (angles_and_rates,), program)
 
 
 def _energies(equations: SceneEquations) -> NamedProgram:
@@ -298,6 +297,21 @@ PROGRAM_OUTPUTS: dict[str, Callable[[SceneEquations], NamedProgram]] = {
     BY_PARAMETERS: _by_parameters,
 }
 """What traces each of the equations."""
+
+
+def write_steps(
+    program: Program, write_operation: Callable[[str, list[str]], str]
+) -> list[str]:
+    """Return a line v0 = .., v1 = .. for each step of a program without routines.
+
+    `write_operation` writes an operation on operands in the language of the lines.
+    """
+    write = program.operand_writer()
+    lines = []
+    for i, (operation, operands) in enumerate(program.steps):
+        assert isinstance(operation, str)
+        lines.append(f"v{i} = {write_operation(operation, [*map(write, operands)])}")
+    return lines
 
 
 def _symbols(arguments: Sequence[Argument]) -> list[str]:

@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sst_ros.code_generation.named_programs import NamedProgram, SceneEquations
-
-INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+from sst_ros.code_generation.named_programs import (
+    INFIX,
+    NamedProgram,
+    SceneEquations,
+    write_steps,
+)
 
 STACK = """
 def _collect(values, *shape):
@@ -163,32 +166,13 @@ def _function(named: NamedProgram, library: Library) -> Iterator[str]:
     for argument in named.arguments:
         symbols = ", ".join(argument.symbols)
         yield f"    {symbols}, = {library.unpack.format(argument.name)}"
-    lines, results = _write_operations(named, library)
+    program = named.program
+    lines = write_steps(program, library.expression)
     yield from (f"    {line}" for line in lines)
+    results = ", ".join(map(program.operand_writer(), program.outputs))
     shape = ", ".join(map(str, named.shape))
-    yield f"    return _collect(({', '.join(results)},), {shape})"
+    yield f"    return _collect(({results},), {shape})"
     if library.wrapper:
         sizes_by_name = ((argument.name, argument.size) for argument in named.arguments)
         sizes = ", ".join(f"{name}={size}" for name, size in sizes_by_name)
         yield f"\n\n{library.wrapper.format(name=named.name, sizes=sizes)}"
-
-
-def _write_operations(
-    named: NamedProgram, library: Library
-) -> tuple[list[str], list[str]]:
-    """Return a line for each step, v0 = .., v1 = .., and the names of the outputs."""
-    program = named.program
-    names = [*program.inputs, *(f"v{i}" for i in range(len(program.steps)))]
-
-    def operand_text(operand: float | int) -> str:
-        if isinstance(operand, int):
-            return names[operand]
-        number = repr(float(operand))
-        return f"({number})" if number.startswith("-") else number
-
-    lines = []
-    for i, (operation, operands) in enumerate(named.steps):
-        lines.append(
-            f"v{i} = {library.expression(operation, [*map(operand_text, operands)])}"
-        )
-    return lines, [operand_text(output) for output in program.outputs]

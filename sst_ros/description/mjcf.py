@@ -16,7 +16,7 @@ has beyond that is named at the head of the file.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,9 +42,9 @@ from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import limits_of, model_of, ranges_of
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
-from sst_ros.scene.loads import JOINTS
+from sst_ros.scene.loads import ACTUATED_JOINTS, JOINTS
 from sst_ros.scene.scene import Scene
-from sst_ros.state import ZERO
+from sst_ros.state import STAR, ZERO
 
 JOINT_KINDS = ("gamma", "mu", "beta")
 
@@ -58,7 +58,7 @@ def mjcf(scene: Scene) -> str:
     """
     geometry = Geometry.of(scene)
     joints = {joint.child: joint for joint in joints_of(geometry)}
-    bodies = dict.fromkeys(joints)
+    bodies: dict[str, Body | None] = dict.fromkeys(joints)
     carried: dict[str, list[Body]] = {}
     for body in bodies_of(scene):
         if body.name.startswith("rotor"):
@@ -71,8 +71,11 @@ def mjcf(scene: Scene) -> str:
     if star is not None:
         third = star._replace(mass=star.mass / 3.0, tensor=star.tensor / 3.0)
         bodies.update(dict.fromkeys(STARS, third))
-    angles = Dynamics.of(scene).joints(*start_of(scene)[:7])
-    places = [JOINTS.index(joint.name) for _, _, joint in _nest(joints) if joint]
+    chains = list(_nest(joints))
+    names = [link.joint.name for link in chains if link.joint is not None]
+    numbers = Dynamics.of(scene).joints(*start_of(scene)[STAR])
+    start_angles = dict(zip(JOINTS, numbers[: len(JOINTS)], strict=True))
+    start_rates = dict(zip(JOINTS, numbers[len(JOINTS) :], strict=True))
     document: str = (
         load_description_templates()
         .get_template("model.mjcf.xml")
@@ -84,7 +87,7 @@ def mjcf(scene: Scene) -> str:
             base=BASE,
             visuals=solids_of_links(shapes(scene)),
             solid=_geom,
-            chains=[*_nest(joints)],
+            chains=chains,
             bodies=bodies,
             carried=carried,
             quaternion=_quaternion,
@@ -97,23 +100,30 @@ def mjcf(scene: Scene) -> str:
                 for k in (2, 3)
                 for end in "et"
             ],
-            actuated=JOINTS[:3],
+            actuated=ACTUATED_JOINTS,
             motor=_motor(scene),
-            start=[angles[i] for i in places],
-            start_rates=[angles[9 + i] for i in places],
+            start=[start_angles[name] for name in names],
+            start_rates=[start_rates[name] for name in names],
         )
     )
     return document
 
 
-def _nest(joints: dict[str, Joint]) -> Iterator[tuple[bool, str, Joint | None]]:
-    """Yield where each body begins, with its joint, and where it ends."""
-    for k in range(3):
-        chained = (ACTUATED_LINKS[k], INTERMEDIATE[k], STARS[k])
-        for link in chained:
-            yield True, link, joints[link]
-        for link in reversed(chained):
-            yield False, link, None
+class _LinkTag(NamedTuple):
+    """Where the element of a link begins, or ends, in a tree of elements."""
+
+    begins: bool
+    link: str
+    joint: Joint | None  # to the link around it, where the element begins
+
+
+def _nest(joints: dict[str, Joint]) -> Iterator[_LinkTag]:
+    """Yield the tags of all moving links, leg by leg, each link inside its parent."""
+    for chain in zip(ACTUATED_LINKS, INTERMEDIATE, STARS, strict=True):
+        for link in chain:
+            yield _LinkTag(True, link, joints[link])
+        for link in reversed(chain):
+            yield _LinkTag(False, link, None)
 
 
 def _sites(scene: Scene, geometry: Geometry) -> dict[str, list[tuple[str, Array]]]:
@@ -135,21 +145,27 @@ def _sites(scene: Scene, geometry: Geometry) -> dict[str, list[tuple[str, Array]
 def _joint_attributes(scene: Scene, geometry: Geometry) -> dict[str, dict[str, Any]]:
     """Return springs, friction, range and rotor of each joint, as MuJoCo names them."""
     model = model_of(scene)
-    ranges = {joint: ends for joint, *ends in ranges_of([*limits_of(scene, geometry)])}
+    ranges: dict[int, list[float]] = {}  # by the number of the joint
+    for joint, lower, upper in ranges_of(list(limits_of(scene, geometry))):
+        ranges[joint] = [lower, upper]
     by_joint: dict[str, dict[str, Any]] = {}
+    motor = scene.actuators
     for number, name in enumerate(JOINTS):
-        angle, leg = divmod(number, 3)
+        angle, leg = divmod(number, len(LEG_NUMBERS))
+        kind = JOINT_KINDS[angle]
         attributes: dict[str, Any] = {}
-        if (spring := model.legs[leg].springs[angle]) is not None:
+        spring = model.legs[leg].springs[angle]
+        if spring is not None:
             attributes["stiffness"] = [spring.stiffness]
             attributes["springref"] = [spring.rest]
-        if (friction := model.legs[leg].friction[angle]) is not None:
+        friction = model.legs[leg].friction[angle]
+        if friction is not None:
             attributes["damping"] = [friction.viscous]
             attributes["frictionloss"] = [friction.coulomb]
-        if JOINT_KINDS[angle] != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
+        # Limits of mu are serial singularities, at which no joint ends.
+        if kind != "mu" and np.isfinite(ranges.get(number, np.inf)).all():
             attributes["range"] = ranges[number]
-        motor = scene.actuators
-        if JOINT_KINDS[angle] == "gamma" and motor is not None and motor.rotor_inertia:
+        if kind == "gamma" and motor is not None and motor.rotor_inertia:
             attributes["armature"] = [motor.gear_ratio**2 * motor.rotor_inertia]
         by_joint[name] = attributes
     return by_joint
@@ -190,7 +206,8 @@ def _quaternion(rotation: Array) -> list[float]:
 
 def _full_inertia(body: Body) -> Array:
     """Return the tensor about the centre of mass as (xx, yy, zz, xy, xz, yz)."""
-    return np.asarray(body.tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.tensor
+    return np.array([xx, yy, zz, xy, xz, yz])
 
 
 def _geom(primitive: str, sizes: Any, position: Any, turn: Any, rgba: Any) -> str:

@@ -36,7 +36,12 @@ import numpy as np
 from sst_ros.dynamics.model import limits_of, ranges_of
 from sst_ros.files import load_templates
 from sst_ros.mechanism.geometry import Array, Geometry
-from sst_ros.scene.loads import JOINTS, Friction
+from sst_ros.scene.loads import (
+    ACTUATED_JOINTS,
+    JOINTS,
+    PASSIVE_JOINTS,
+    Friction,
+)
 from sst_ros.scene.scene import Scene
 from sst_ros.state import BASE_FRAME, Vector3
 
@@ -60,10 +65,10 @@ LEG_COLOURS: tuple[Colour, ...] = (
     (0.84, 0.37, 0.00),
     (0.00, 0.62, 0.45),
 )
-"""Colours of legs 1 to 3 distinguishable with colour blindness (Okabe and Ito)."""
+"""Colours of legs 1 to 3, distinct also with colour blindness (Okabe and Ito)."""
 
 LEAST_MASS = 1e-10
-"""Mass [kg] and moments of inertia [kg m^2] that MuJoCo gives a link without them."""
+"""Least mass [kg], and least moment of inertia [kg m^2], that MuJoCo gives a link."""
 
 ARC_STEP = np.radians(6.0)
 """Arcs are drawn as chords of this angle or less: 0.14 % of the radius off."""
@@ -73,11 +78,13 @@ CARRIAGE = 3.0 * np.array([1.0, 1.3, 1.3])
 """Sides of a carriage on an arm of the star, in radii of a drawn bar."""
 
 SERVO_TORQUE = 10.6
-SERVO_RATE = np.pi
-"""Limits of an actuator whose scene has none [N m], [rad/s]: stall torque and speed
-without load (30 rev/min) of a geared servo for arms of this size, ROBOTIS XM540-W270 at
+"""Torque limit of an actuator whose scene has none [N m].
+
+It is the stall torque of a geared servo for arms of this size, ROBOTIS XM540-W270 at
 12 V.
 """
+SERVO_RATE = np.pi
+"""Rate limit of such an actuator [rad/s]: the servo's speed without load."""
 
 PLUGIN = "joint_state_topic_hardware_interface/JointStateTopicSystem"
 LOCKSTEP_PLUGIN = "sst_ros_hardware/LockstepSystem"
@@ -85,14 +92,13 @@ TOPICS = "/sst_simulator/commands_stamped", "/joint_states"
 """Of commands and states, by which ros2_control drives a simulator."""
 
 NEGLIGIBLE_MASS = 1e-12
+"""Mass of a moving link that has none in the scene [kg]."""
 NEGLIGIBLE_INERTIA = 2e-14
-"""Mass and inertia of a moving link that has none in the scene [kg, kg m^2].
+"""Moment of inertia of such a link [kg m^2].
 
-MuJoCo refuses less than 1e-14. Beside the star's inertia, some 1e-2 kg m^2, they are
-lost in the rounding of a few operations.
+MuJoCo refuses less than 1e-14. Beside that of the star, some 1e-2 kg m^2, it is lost in
+the rounding of a few operations.
 """
-
-_INERTIA_NAMES = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class Joint(NamedTuple):
@@ -140,9 +146,8 @@ def rotations(joints: Iterable[Joint], angles: Mapping[str, float]) -> dict[str,
         angle = angles[joint.name]
         # Rodrigues' formula; `across` is the cross product with the axis.
         across = np.cross(np.eye(3), np.array(joint.axis))
-        turn = (
-            np.eye(3) + np.sin(angle) * across + (1.0 - np.cos(angle)) * across @ across
-        )
+        versine = 1.0 - np.cos(angle)
+        turn = np.eye(3) + np.sin(angle) * across + versine * across @ across
         frames[joint.child] = frames[joint.parent] @ (joint.origin @ turn)
     return frames
 
@@ -328,7 +333,7 @@ def _render_urdf(
     bodies = {body.name: body for body in _with_negligible_bodies(scene_bodies, joints)}
     links = dict.fromkeys((BASE, *(joint.child for joint in joints), *bodies))
     initial = scene.initial
-    starts = zip(JOINTS[:3], initial.gamma, initial.gamma_dot, strict=True)
+    starts = zip(ACTUATED_JOINTS, initial.gamma, initial.gamma_dot, strict=True)
     template = load_description_templates().get_template("urdf.xml")
     document: str = template.render(
         name=xml_name(scene),
@@ -345,7 +350,7 @@ def _render_urdf(
         starts=list(starts),
         topics=topics,
         least=LEAST_MASS,
-        passive=JOINTS[3:],
+        passive=PASSIVE_JOINTS,
         plugin=LOCKSTEP_PLUGIN if lockstep else PLUGIN,
         roll_pitch_yaw=roll_pitch_yaw,
     )
@@ -419,9 +424,8 @@ class Body(NamedTuple):
     @property
     def inertia(self) -> dict[str, float]:
         """Entries of the tensor by their names in URDF."""
-        return dict(
-            zip(_INERTIA_NAMES, self.tensor[np.triu_indices(3)].tolist(), strict=True)
-        )
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.tensor.tolist()
+        return {"ixx": xx, "ixy": xy, "ixz": xz, "iyy": yy, "iyz": yz, "izz": zz}
 
 
 def bodies_of(scene: Scene) -> Iterator[Body]:

@@ -30,7 +30,7 @@ Below it rounding, over its square, leaves gamma_dot less than six digits.
 NO_ASSEMBLY = -1  # gamma has no unique admissible assembly
 NO_RATE = -2  # gamma_dot is no motion there
 
-BLOCK = 2000  # starts solved at once: their arrays fit the cache
+STARTS_AT_ONCE = 2000  # starts solved at once: their arrays fit the cache
 
 
 def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
@@ -52,7 +52,7 @@ def initial_state(scene: Scene, geometry: Geometry) -> tuple[float, ...]:
     else:
         rotation = kinematics.admissible(geometry, gamma).rotation
     rate = np.zeros(3)
-    if gamma_dot.any():  # rest needs no Jacobian, which a singular posture has not
+    if gamma_dot.any():  # at rest no Jacobian is needed: a singular posture has none
         posture = virtual_work.posture(geometry, gamma, rotation)
         determinant = float(np.linalg.det(posture.j2))
         if abs(determinant) < SINGULAR_START:
@@ -68,33 +68,40 @@ def initial_states(
     gamma: Array,
     gamma_dot: Array,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """States at t = 0 of many runs, of which one that cannot start stops no other.
+    """Return the states at t = 0 of many runs; one that cannot start stops no other.
 
-    They have gamma [rad] and gamma_dot [rad/s], shape (n, 3), and the geometries of
-    index `geometry_index`, shape (n,). Returns quaternions and body rates [rad/s],
-    shape (7, n), at rest where there is no start, and codes, shape (n,): 0, NO_ASSEMBLY
-    or NO_RATE.
+    Args:
+        geometries: of the runs, the distinct ones.
+        geometry_index: which of them each run has, shape (n,).
+        gamma: initial angles of the actuators [rad], shape (n, 3).
+        gamma_dot: their rates [rad/s], shape (n, 3).
+
+    Returns:
+        Quaternions and body rates [rad/s], shape (7, n), at rest where there is no
+        start; and codes, shape (n,): 0, NO_ASSEMBLY or NO_RATE.
+
     """
-    states = np.zeros((7, len(gamma)))
-    quaternions, rates = states[:4], states[4:]
+    count = len(gamma)
+    quaternions = np.zeros((4, count))
     quaternions[-1] = 1.0
-    codes = np.full(len(gamma), NO_ASSEMBLY, dtype=np.int64)
-    for first in range(0, len(gamma), BLOCK):
-        block = slice(first, first + BLOCK)
+    rates = np.zeros((3, count))
+    codes = np.full(count, NO_ASSEMBLY, dtype=np.int64)
+    for first in range(0, count, STARTS_AT_ONCE):
+        block = slice(first, first + STARTS_AT_ONCE)
         # Equal starts, a geometry and its gamma, are solved once.
         starts = np.column_stack([geometry_index[block], gamma[block]])
-        distinct, index = np.unique(starts, axis=0, return_inverse=True)
-        index = index.ravel()
+        distinct, start_of_row = np.unique(starts, axis=0, return_inverse=True)
+        start_of_row = start_of_row.ravel()
         own = geometries.of_rows(distinct[:, 0].astype(np.intp))
         assemblies = kinematics.direct_many(own, distinct[:, 1:])
         admissible = np.flatnonzero(assemblies.admissible)
         owner = assemblies.configuration[admissible]
-        assembly_of = np.zeros(len(distinct), dtype=np.intp)
-        assembly_of[owner] = admissible
+        assembly_of_start = np.zeros(len(distinct), dtype=np.intp)
+        assembly_of_start[owner] = admissible
         counts = np.bincount(owner, minlength=len(distinct))
-        unique = np.flatnonzero(counts[index] == 1)
+        unique = np.flatnonzero(counts[start_of_row] == 1)
         rows = first + unique
-        selected = assembly_of[index[unique]]
+        selected = assembly_of_start[start_of_row[unique]]
         quaternions[:, rows] = quaternion_of(assemblies.rotation[selected]).T
         moves = gamma_dot[rows].any(axis=1)
         singular = moves & (np.abs(assemblies.det_j2[selected]) < SINGULAR_START)
@@ -104,7 +111,7 @@ def initial_states(
         rotation = assemblies.rotation[selected[moves]]
         geometry = geometries.of_rows(geometry_index[rows])
         rates[:, rows] = _body_rates(geometry, rotation, gamma_dot[rows]).T
-    return states, codes
+    return np.vstack([quaternions, rates]), codes
 
 
 def _body_rates(geometry: Geometry, rotation: Array, gamma_dot: Array) -> Array:
@@ -123,7 +130,7 @@ def _body_rates(geometry: Geometry, rotation: Array, gamma_dot: Array) -> Array:
 def start_of(scene: Scene) -> tuple[float, ...]:
     """Return `initial_state` of a scene.
 
-    InputError where gamma is outside the stroke.
+    InputError is raised where gamma is outside the stroke.
     """
     geometry = Geometry.of(scene)
     gamma = np.array(scene.initial.gamma)
@@ -168,10 +175,11 @@ def derive_by_paper(scene: Scene) -> Callable[..., tuple[float, ...]]:
 
     def derivative(_time: float, *inputs: float) -> tuple[float, ...]:
         x, y, z, w, wx, wy, wz, _work, *drive = inputs
-        torque = np.array(drive[:3])
+        tau_1, tau_2, tau_3, *topic_moment = drive
+        torque = np.array((tau_1, tau_2, tau_3))
         moment = constant
-        if len(drive) > len(torque):
-            moment = constant + drive[3:]
+        if topic_moment:
+            moment = constant + topic_moment
         rotation = rotation_matrix((x, y, z, w))
         omega: Array = rotation @ np.array((wx, wy, wz))
         gamma, _, _ = kinematics.inverse(mechanism.geometry, rotation)

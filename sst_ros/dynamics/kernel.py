@@ -27,7 +27,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from sst_ros.dynamics.model import JOINT_NAMES, ElasticStops, Leg, Model, model_of
+from sst_ros.dynamics.model import (
+    AT_BETA,
+    AT_GAMMA,
+    AT_MU,
+    JOINT_NAMES,
+    LEGS,
+    ElasticStops,
+    Leg,
+    Model,
+    model_of,
+)
 from sst_ros.dynamics.own_loads import LoadConstants, load_program, run_program
 from sst_ros.mechanism.generic_math import (
     Quadruple,
@@ -50,6 +60,7 @@ from sst_ros.mechanism.generic_math import (
     sqrt,
     symmetric_rows,
     tanh,
+    transform,
     triple,
 )
 from sst_ros.scene.bodies import PLACES
@@ -61,9 +72,9 @@ __all__ = ["Leg", "Model", "model_of"]
 
 
 class LegMotion(NamedTuple):
-    """One leg at one instant, vectors in {E} but for `outward`.
+    """One leg at one instant, with the letters of this module's docstring.
 
-    For letters see above.
+    All vectors but `outward` are in {E}.
     """
 
     leg: Leg
@@ -93,15 +104,17 @@ def derivative(
     acts on the star, in {B} [N m].
     """
     x, y, z, w, wx, wy, wz, *lagged = state
+    q = (x, y, z, w)
+    rate = (wx, wy, wz)
     lag_rates: tuple[Scalar, ...] = ()
     lag = model.time_constant
     if lag is not None:
         pairs = zip(torque, lagged, strict=True)
         lag_rates = tuple((command - acting) / lag for command, acting in pairs)
         torque = triple(lagged)
-    inertia, force, _ = balance(model, (x, y, z, w), (wx, wy, wz), torque, moment)
+    inertia, force, _ = balance(model, q, rate, torque, moment)
     acceleration = solve_symmetric(inertia, force)
-    return (*quaternion_rate((x, y, z, w), (wx, wy, wz)), *acceleration, *lag_rates)
+    return (*quaternion_rate(q, rate), *acceleration, *lag_rates)
 
 
 def actuator_torque(
@@ -141,9 +154,10 @@ def balance(
     """
     rows = rotation_rows(q)
     inertia: tuple[Scalar, ...] = model.star
-    force = cross3(triple(dot3(row, rate) for row in symmetric_rows(model.star)), rate)
-    field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
+    force = cross3(transform(symmetric_rows(model.star), rate), rate)
+    field = ZERO
     if model.gravity is not None:
+        field = rotate_back(rows, model.gravity)
         force = add(force, cross3(model.weight, field))
     for external in (model.moment, moment):
         if external is not None:
@@ -154,89 +168,129 @@ def balance(
     jacobian = []
     for k, (leg, drive) in enumerate(zip(model.legs, torque, strict=True)):
         motion = leg_motion(leg, rows, rate)
-        a = motion.a
-        a_dot = motion.a_dot
-        gamma_dot = motion.gamma_dot
         p = motion.p
-        u = motion.u
         g = motion.g
         jacobian.append(g)
-        a_rest, gamma_rest = rest_accelerations(motion, rate)
-        # T = C a_dot gamma_dot + A gamma_dot^2 / 2; slopes are d/da.
-        a_inertia = leg.a0 + leg.a2 * (a * a)
-        a_slope = 2.0 * leg.a2 * a
-        c_inertia = 0.0
-        c_slope = 0.0
-        if leg.ixy or leg.ixz or leg.iyz:
-            root = sqrt(u)
-            c_inertia = leg.ixz * a / root - leg.ixy
-            c_slope = leg.ixz / (u * root)
-            a_inertia = a_inertia - 2.0 * leg.iyz * a * root
-            a_slope = a_slope - 2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
-        force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
-        force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
-        force_gamma = (
-            force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
-        )
-        toward_a = multiply(c_inertia, g)
-        toward_gamma = axpy(a_inertia, g, c_inertia, p)
-        at_gamma, at_mu, at_beta = joint_torques(motion, field)
+        forces = _inertia_forces(motion, rate, drive)
+        loads = joint_torques(motion, field)
         if own is not None:
-            at_gamma, at_mu, at_beta = add((at_gamma, at_mu, at_beta), own.joints[k])
-        force_gamma = force_gamma - at_gamma
+            loads = add(loads, own.joints[k])
+        at_gamma, at_mu, at_beta = loads
+        force_gamma = forces.gamma - at_gamma
+        force_a = forces.a
         # Python's 0.0 is no load at mu: then no square root is traced for it.
         if not (type(at_mu) is float and at_mu == 0.0):
-            force_a = force_a + at_mu / sqrt(u)  # mu_dot = -a_dot / sqrt(u)
+            force_a = force_a + at_mu / sqrt(motion.u)  # mu_dot = -a_dot / sqrt(u)
         force = triple(f + at_beta * b for f, b in zip(force, motion.b, strict=True))
         force = triple(
             f - force_a * along - force_gamma * across
             for f, along, across in zip(force, p, g, strict=True)
         )
         inertia = tuple(
-            m + toward_a[i] * p[j] + toward_gamma[i] * g[j]
-            for m, (i, j) in zip(inertia, PLACES, strict=True)
+            entry + forces.a_row[i] * p[j] + forces.gamma_row[i] * g[j]
+            for entry, (i, j) in zip(inertia, PLACES, strict=True)
         )
     xx, yy, zz, xy, xz, yz = inertia
-    return (xx, yy, zz, xy, xz, yz), force, (jacobian[0], jacobian[1], jacobian[2])
+    return (xx, yy, zz, xy, xz, yz), force, triple(jacobian)
+
+
+class InertiaForces(NamedTuple):
+    """What the inertia of a leg takes at its coordinates a and gamma.
+
+    That is a_row.W_dot + a at a, and gamma_row.W_dot + gamma, less the torque of the
+    actuator, at gamma.
+    """
+
+    a_row: Triple
+    a: Scalar
+    gamma_row: Triple
+    gamma: Scalar
+
+
+def _inertia_forces(motion: LegMotion, rate: Triple, drive: Scalar) -> InertiaForces:
+    """Apply Lagrange's equations to T = C a_dot gamma_dot + A gamma_dot^2 / 2."""
+    leg = motion.leg
+    a = motion.a
+    a_dot = motion.a_dot
+    gamma_dot = motion.gamma_dot
+    a_rest, gamma_rest = rest_accelerations(motion, rate)
+    # A and C, and their derivatives by a
+    a_inertia = leg.a0 + leg.a2 * (a * a)
+    a_slope = 2.0 * leg.a2 * a
+    c_inertia = 0.0
+    c_slope = 0.0
+    if leg.ixy or leg.ixz or leg.iyz:
+        root = sqrt(motion.u)
+        c_inertia = leg.ixz * a / root - leg.ixy
+        c_slope = leg.ixz / (motion.u * root)
+        a_inertia = a_inertia - 2.0 * leg.iyz * a * root
+        a_slope = a_slope - 2.0 * leg.iyz * (1.0 - 2.0 * a * a) / root
+    force_a = c_inertia * gamma_rest - 0.5 * a_slope * gamma_dot * gamma_dot
+    force_gamma = a_inertia * gamma_rest + c_inertia * a_rest - drive
+    force_gamma = force_gamma + a_slope * a_dot * gamma_dot + c_slope * a_dot * a_dot
+    a_row = multiply(c_inertia, motion.g)
+    gamma_row = axpy(a_inertia, motion.g, c_inertia, motion.p)
+    return InertiaForces(a_row, force_a, gamma_row, force_gamma)
+
+
+def split_motion(state: Sequence[Scalar]) -> tuple[Quadruple, Triple]:
+    """Return the quaternion and the body rate W that a state begins with."""
+    x, y, z, w, wx, wy, wz, *_ = state
+    return (x, y, z, w), (wx, wy, wz)
 
 
 def joints(model: Model, state: tuple[Scalar, ...]) -> Joints:
     """Angles and rates of all joints. See `kinematics.inverse` for the branches."""
     of_legs = []
     for motion in leg_motions(model, state):
-        angles = [joint_angle(motion, joint) for joint in range(3)]
-        rates = [joint_rate(motion, joint) for joint in range(3)]
+        angles = [joint_angle(motion, joint) for joint in (AT_GAMMA, AT_MU, AT_BETA)]
+        rates = [joint_rate(motion, joint) for joint in (AT_GAMMA, AT_MU, AT_BETA)]
         of_legs.append([*angles, *rates])
     return Joints(*zip(*of_legs, strict=True))
 
 
 def leg_motions(model: Model, state: Sequence[Scalar]) -> Iterator[LegMotion]:
     """Yield the motion of each leg; the state begins with quaternion and W."""
-    x, y, z, w, wx, wy, wz = state[:7]
-    rows = rotation_rows((x, y, z, w))
+    q, rate = split_motion(state)
+    rows = rotation_rows(q)
     for leg in model.legs:
-        yield leg_motion(leg, rows, (wx, wy, wz))
+        yield leg_motion(leg, rows, rate)
 
 
 def leg_motion(leg: Leg, rows: Rows, rate: Triple) -> LegMotion:
     """Vectors and rates of a leg; `rows` are the rows of R, `rate` is W."""
-    e0, e1 = leg.e0, leg.e1
+    e0 = leg.e0
+    e1 = leg.e1
     x, y, z = rotate_back(rows, leg.w)
-    a, across = e0 * x + e1 * y, e0 * y - e1 * x
+    a = e0 * x + e1 * y
+    across = e0 * y - e1 * x  # (t x w) along z
     p = (e1 * z, -(e0 * z), across)
     u = across * across + z * z
     g = ((x - a * e0) / u, (y - a * e1) / u, z / u)
     b = ((a * x - e0) / u, (a * y - e1) / u, a * z / u)
-    outward = triple(dot3(row, p) for row in rows)
-    rates = dot3(g, rate), dot3(p, rate), dot3(b, rate)
-    return LegMotion(leg, (x, y, z), (e0, e1, 0.0), a, p, u, g, b, outward, *rates)
+    outward = transform(rows, p)
+    return LegMotion(
+        leg=leg,
+        axis=(x, y, z),
+        along=(e0, e1, 0.0),
+        a=a,
+        p=p,
+        u=u,
+        g=g,
+        b=b,
+        outward=outward,
+        gamma_dot=dot3(g, rate),
+        a_dot=dot3(p, rate),
+        beta_dot=dot3(b, rate),
+    )
 
 
 def rest_accelerations(motion: LegMotion, rate: Triple) -> tuple[Scalar, Scalar]:
     """Accelerations of the coordinates a and gamma of a leg at W_dot = 0."""
     along = dot3(motion.along, rate)
     a_rest = dot3(motion.axis, rate) * along - motion.a * dot3(rate, rate)
-    return a_rest, motion.a_dot * (2.0 * motion.a * motion.gamma_dot - along) / motion.u
+    products = motion.a_dot * (2.0 * motion.a * motion.gamma_dot - along)
+    return a_rest, products / motion.u
 
 
 def actuator_acceleration(
@@ -246,7 +300,7 @@ def actuator_acceleration(
 
     The state begins with quaternion and W.
     """
-    rate = triple(state[4:7])
+    _, rate = split_motion(state)
     gamma_ddot = []
     for motion in leg_motions(model, state):
         _, gamma_rest = rest_accelerations(motion, rate)
@@ -256,7 +310,7 @@ def actuator_acceleration(
 
 def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     """Kinetic energy of all seven links, payload and rotors [J]."""
-    wx, wy, wz = state[4:7]
+    _, (wx, wy, wz) = split_motion(state)
     ixx, iyy, izz, ixy, ixz, iyz = model.star
     total = ixx * wx * wx + iyy * wy * wy + izz * wz * wz
     total = total + 2.0 * (ixy * wx * wy + ixz * wx * wz + iyz * wy * wz)
@@ -274,10 +328,13 @@ def kinetic_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
 
 def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
     """Potential energy [J]: weight, springs and elastic stops."""
-    x, y, z, w = state[:4]
-    rows = rotation_rows((x, y, z, w))
-    field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
-    total: Scalar = 0.0 if model.gravity is None else -dot3(model.weight, field)
+    q, rate = split_motion(state)
+    rows = rotation_rows(q)
+    field = ZERO
+    total: Scalar = 0.0
+    if model.gravity is not None:
+        field = rotate_back(rows, model.gravity)
+        total = -dot3(model.weight, field)
     for motion in leg_motions(model, state):
         leg = motion.leg
         own = 0.0
@@ -286,18 +343,19 @@ def potential_energy(model: Model, state: tuple[Scalar, ...]) -> Scalar:
                 stretch = joint_angle(motion, joint) - spring.rest
                 own = own + 0.5 * spring.stiffness * stretch * stretch
         if leg.stops is not None:
-            gamma = joint_angle(motion, 0)
+            gamma = joint_angle(motion, AT_GAMMA)
             for depth in (positive(-gamma), positive(gamma - leg.stops.arc)):
                 own = own + 0.5 * leg.stops.stiffness * depth * depth
         if any(leg.drive) or any(leg.link):
-            first, second = _directions(motion)
-            own = own - dot3(_combine(leg.drive, *first), field)
-            own = own - dot3(_combine(leg.link, *second), field)
+            first, second = _link_axes(motion)
+            own = own - dot3(rotate_back(first, leg.drive), field)
+            own = own - dot3(rotate_back(second, leg.link), field)
         total = total + own
     legs = list(leg_motions(model, state)) if model.own_loads else []
     for load in model.own_loads:
         if load.formula.potential is not None:
-            total = total + _run_load(load, rows, triple(state[4:7]), legs)[0]
+            energy, *_ = _run_load(load, rows, rate, legs)
+            total = total + energy
     return total
 
 
@@ -313,38 +371,39 @@ def power(
     energy. With lag the torques are the state's own.
     """
     x, y, z, w, wx, wy, wz, *lagged = state
+    rate = (wx, wy, wz)
     rows = rotation_rows((x, y, z, w))
     acting = torque if model.time_constant is None else lagged
     total: Scalar = 0.0
     for motion, drive in zip(leg_motions(model, state), acting, strict=True):
         total = total + drive * motion.gamma_dot
-        leg = motion.leg
-        lost = 0.0
-        for joint, friction in enumerate(leg.friction):
-            if friction is not None:
-                lost = lost + friction_torque(
-                    friction, joint_rate(motion, joint)
-                ) * joint_rate(motion, joint)
-        if leg.stops is not None and leg.stops.damping:
-            gamma, speed = joint_angle(motion, 0), motion.gamma_dot
-            elastic = leg.stops._replace(damping=0.0)
-            excess = stop_torque(elastic, gamma, speed) - stop_torque(
-                leg.stops, gamma, speed
-            )
-            lost = lost + excess * speed
-        total = total - lost
+        total = total - _lost_power(motion)
     for external in (model.moment, moment):
         if external is not None:
-            total = total + dot3(
-                external, triple(dot3(row, (wx, wy, wz)) for row in rows)
-            )
+            total = total + dot3(external, transform(rows, rate))
     for load in model.own_loads:
         if load.formula.moment:
             legs = list(leg_motions(model, state))
-            total = total + dot3(
-                _own_moment(load, rows, (wx, wy, wz), legs), (wx, wy, wz)
-            )
+            total = total + dot3(_own_moment(load, rows, rate, legs), rate)
     return total
+
+
+def _lost_power(motion: LegMotion) -> Scalar:
+    """Return the power [W] that friction and the damping of stops take from a leg."""
+    leg = motion.leg
+    lost = 0.0
+    for joint, friction in enumerate(leg.friction):
+        if friction is not None:
+            rate = joint_rate(motion, joint)
+            lost = lost + friction_torque(friction, rate) * rate
+    if leg.stops is not None and leg.stops.damping:
+        gamma = joint_angle(motion, AT_GAMMA)
+        speed = motion.gamma_dot
+        elastic = leg.stops._replace(damping=0.0)
+        elastic_torque = stop_torque(elastic, gamma, speed)
+        damping_torque = elastic_torque - stop_torque(leg.stops, gamma, speed)
+        lost = lost + damping_torque * speed
+    return lost
 
 
 # Loads of one leg: gravity, friction, springs and elastic stops. What the scene does
@@ -355,7 +414,7 @@ def joint_torques(motion: LegMotion, field: Triple) -> Triple:
     """Torques [N m] of the loads at gamma, mu and beta; `field` is gravity in {E}."""
     leg = motion.leg
     torques = []
-    for joint in range(3):
+    for joint in (AT_GAMMA, AT_MU, AT_BETA):
         rubbing = 0.0
         restoring = 0.0
         friction = leg.friction[joint]
@@ -368,16 +427,15 @@ def joint_torques(motion: LegMotion, field: Triple) -> Triple:
     at_gamma = 0.0
     at_mu = 0.0
     if any(leg.drive) or any(leg.link):  # weight: moments about w_k and -r_k
-        of_drive, of_link = _directions(motion)
-        on_link = cross3(_combine(leg.link, *of_link), field)
-        on_drive = cross3(_combine(leg.drive, *of_drive), field)
-        r = of_drive[0]
+        of_drive, of_link = _link_axes(motion)
+        on_link = cross3(rotate_back(of_link, leg.link), field)
+        on_drive = cross3(rotate_back(of_drive, leg.drive), field)
+        r, _, _ = of_drive
         at_gamma = dot3(add(on_link, on_drive), motion.axis)
         at_mu = -dot3(on_link, r)
     if leg.stops is not None:
-        at_gamma = at_gamma + stop_torque(
-            leg.stops, joint_angle(motion, 0), motion.gamma_dot
-        )
+        gamma = joint_angle(motion, AT_GAMMA)
+        at_gamma = at_gamma + stop_torque(leg.stops, gamma, motion.gamma_dot)
     of_gamma, of_mu, of_beta = torques
     return of_gamma + at_gamma, of_mu + at_mu, of_beta
 
@@ -404,7 +462,7 @@ def own_torques(model: Model, rows: Rows, rate: Triple) -> OwnTorques:
         for i, row in enumerate(rows, start=1):
             by_row = triple(by_name.get(f"R{i}{j}", 0.0) for j in (1, 2, 3))
             star = add(star, cross3(row, by_row))  # -G_i x R_i
-        for k in range(3):
+        for k in range(LEGS):
             angles = (f"{joint}_{k + 1}" for joint in JOINT_NAMES)
             torques = triple(-by_name.get(name, 0.0) for name in angles)
             joints[k] = add(joints[k], torques)
@@ -431,7 +489,8 @@ def _run_load(
 def _quantity(name: str, rows: Rows, rate: Triple, legs: Sequence[LegMotion]) -> Scalar:
     """Return what a name in a formula means: see `scene.own_loads.STATE_NAMES`."""
     if name in ROTATION:
-        return rows[int(name[1]) - 1][int(name[2]) - 1]
+        row, column = divmod(ROTATION.index(name), 3)
+        return rows[row][column]
     if name in OMEGA:
         return dot3(rows[OMEGA.index(name)], rate)
     if name in BODY_RATE:
@@ -456,7 +515,8 @@ def friction_torque(friction: Friction, v: Scalar) -> Scalar:
 
 def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar:
     """Torque of elastic stops; its damping grows with the depth (Hunt-Crossley)."""
-    low, high = positive(-gamma), positive(gamma - stops.arc)
+    low = positive(-gamma)
+    high = positive(gamma - stops.arc)
     if not stops.damping:
         return stops.stiffness * (low - high)
     inward = stops.damping * gamma_dot
@@ -466,40 +526,39 @@ def stop_torque(stops: ElasticStops, gamma: Scalar, gamma_dot: Scalar) -> Scalar
 
 
 def joint_rate(motion: LegMotion, joint: int) -> Scalar:
-    """Rate of gamma (0), mu (1) or beta (2) [rad/s]."""
-    if joint == 0:
+    """Rate of a joint, AT_GAMMA, AT_MU or AT_BETA [rad/s]."""
+    if joint == AT_GAMMA:
         return motion.gamma_dot
-    if joint == 1:
+    if joint == AT_MU:
         return -motion.a_dot / sqrt(motion.u)
     return motion.beta_dot
 
 
 def joint_angle(motion: LegMotion, joint: int) -> Scalar:
-    """Angle of gamma (0), mu (1) or beta (2) [rad]."""
+    """Angle of a joint, AT_GAMMA, AT_MU or AT_BETA [rad]."""
     return atan2(*direction_of(motion, joint))
 
 
 def direction_of(motion: LegMotion, joint: int) -> tuple[Scalar, Scalar]:
-    """Sine and cosine of gamma (0), mu (1) or beta (2).
+    """Sine and cosine of the angle of a joint, AT_GAMMA, AT_MU or AT_BETA.
 
-    Times sqrt(u) but those of mu.
+    Those of gamma and beta are multiplied by sqrt(u).
     """
-    if joint == 0:
+    if joint == AT_GAMMA:
         leg = motion.leg
         return dot3(motion.outward, leg.across), dot3(motion.outward, leg.v)
-    if joint == 1:
+    if joint == AT_MU:
         return sqrt(motion.u), motion.a
-    # r.(t x s) and r.s with s = (0, 0, 1).
-    return motion.p[0] * motion.along[1] - motion.p[1] * motion.along[0], motion.p[2]
+    # p.(t x s) and p.s with s = (0, 0, 1)
+    t_x, t_y, _ = motion.along
+    p_x, p_y, p_z = motion.p
+    return p_x * t_y - p_y * t_x, p_z
 
 
-def _directions(leg: LegMotion) -> tuple[Rows, Rows]:
+def _link_axes(motion: LegMotion) -> tuple[Rows, Rows]:
     """Axes of {1k} = [r, w x r, w] and {2k} = [r, t x r, t] in {E}."""
-    root = sqrt(leg.u)
-    r = triple(component / root for component in leg.p)
-    return (r, cross3(leg.axis, r), leg.axis), (r, cross3(leg.along, r), leg.along)
-
-
-def _combine(c: Triple, x: Triple, y: Triple, z: Triple) -> Triple:
-    """Return the vector with the components c along the axes x, y and z."""
-    return triple(c[0] * x[i] + c[1] * y[i] + c[2] * z[i] for i in range(3))
+    root = sqrt(motion.u)
+    r = triple(component / root for component in motion.p)
+    w = motion.axis
+    t = motion.along
+    return (r, cross3(w, r), w), (r, cross3(t, r), t)

@@ -15,13 +15,23 @@ from sst_ros.mechanism.generic_math import Symmetric, Triple, cross3, multiply, 
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.bodies import PLACES, Payload, Star, Stroke, entries_of
 from sst_ros.scene.loads import Friction
-from sst_ros.state import ZERO
+from sst_ros.state import JOINT_COUNT, ZERO
 
+LEGS = 3
 JOINT_NAMES = ("gamma", "mu", "beta")  # of a leg, from the base to the star
+# their places in the joints of a leg
+AT_GAMMA = 0
+AT_MU = 1
+AT_BETA = 2
 # distance of mu_k from 0 and pi [rad] within which gamma_k has lost its meaning
 SINGULAR_MU = 1e-6
 # farther beyond than this [rad], an actuator has not just reached the contact
 CONTACT_BAND = 1e-9
+_FREE_BEYOND = 4.0 * CONTACT_BAND
+"""Distance from an elastic stop [rad] from which on there is no contact.
+
+It is well beyond the band in which an actuator may still be at the contact.
+"""
 # a distance below this [rad] counts as zero: closure and rounding reach 1e-15
 GRAZING = 1e-12
 _STEP_WIDTH = 2.0
@@ -111,60 +121,90 @@ def model_of(scene: Any, geometry: Geometry | None = None) -> Model:
         pairs = zip(star, scene.payload.entries, strict=True)
         star = [entry + payload_entry for entry, payload_entry in pairs]
     legs = []
-    for k in range(3):
-        w = tuple(geometry.of_leg("w", k))
-        v = tuple(geometry.of_leg("v", k))
+    for k in range(LEGS):
+        _, _, drive_zz, *_ = actuated_inertia(scene, k)
+        xx, *_ = entries_of(scene.intermediate_links[k].inertia)
         e = tuple(geometry.of_leg("e", k))
-        actuated = scene.actuated_links[k]
-        intermediate = scene.intermediate_links[k]
-        _, _, drive_zz, *_ = entries_of(actuated.inertia)
-        if scene.actuators is not None:
-            gear = scene.actuators.gear_ratio
-            drive_zz = drive_zz + gear * gear * scene.actuators.rotor_inertia
-        xx, yy, zz, xy, xz, yz = entries_of(intermediate.inertia)
         # Across t_k the link turns as the star: Ixx (1 - t t^T) is the star's.
         star = [
             entry + xx * (float(i == j) - e[i] * e[j])
             for entry, (i, j) in zip(star, PLACES, strict=True)
         ]
-        drive = ZERO
-        link = ZERO
-        if scene.gravity is not None:
-            drive = multiply(actuated.mass, actuated.centre)
-            link = multiply(intermediate.mass, intermediate.centre)
-        stops = None
-        if scene.stroke.stiffness is not None:
-            arc = geometry.of_leg("arc", k)
-            stops = ElasticStops(arc, scene.stroke.stiffness, damping)
-        a0 = drive_zz + yy - xx
-        a2 = zz - yy + xx
-        springs = _springs_of(scene, k)
-        legs.append(
-            Leg(
-                w=w, v=v, across=cross3(w, v), e0=e[0], e1=e[1],
-                a0=a0, a2=a2, ixy=xy, ixz=xz, iyz=yz,
-                friction=_friction_of(scene), springs=springs,
-                drive=drive, link=link, stops=stops,
-            )
-        )  # fmt: skip
-    gravity = None if scene.gravity is None else scene.gravity.acceleration
-    moment = None if scene.moment is None else scene.moment.value
-    actuators = scene.actuators
+        legs.append(_leg_of(scene, geometry, k, drive_zz, damping))
+    gravity = None
+    if scene.gravity is not None:
+        gravity = scene.gravity.acceleration
+    moment = None
+    if scene.moment is not None:
+        moment = scene.moment.value
+    time_constant = None
+    if scene.actuators is not None:
+        time_constant = scene.actuators.time_constant
+    weight = [sum(body.mass * body.centre[i] for body in carried) for i in range(3)]
     return Model(
         star=tuple(star),
-        legs=(legs[0], legs[1], legs[2]),
+        legs=triple(legs),
         gravity=gravity,
-        weight=triple(
-            sum(body.mass * body.centre[i] for body in carried) for i in range(3)
-        ),
+        weight=triple(weight),
         moment=moment,
-        time_constant=None if actuators is None else actuators.time_constant,
+        time_constant=time_constant,
         own_loads=tuple(map(load_constants, scene.own_loads)),
     )
 
 
+def actuated_inertia(scene: Any, k: int) -> list[Any]:
+    """Return the inertia of the actuated link of leg k with its rotor's [kg m^2].
+
+    It has the entries xx, yy, zz, xy, xz and yz in {1k}.
+    """
+    xx, yy, zz, *products = entries_of(scene.actuated_links[k].inertia)
+    if scene.actuators is not None:
+        gear = scene.actuators.gear_ratio
+        zz = zz + gear * gear * scene.actuators.rotor_inertia
+    return [xx, yy, zz, *products]
+
+
+def _leg_of(scene: Any, geometry: Geometry, k: int, drive_zz: Any, damping: Any) -> Leg:
+    """Collect the constants of leg k, with the inertia of its drive about w_k."""
+    w = tuple(geometry.of_leg("w", k))
+    v = tuple(geometry.of_leg("v", k))
+    e0, e1, _ = geometry.of_leg("e", k)
+    actuated = scene.actuated_links[k]
+    intermediate = scene.intermediate_links[k]
+    xx, yy, zz, xy, xz, yz = entries_of(intermediate.inertia)
+    drive = ZERO
+    link = ZERO
+    if scene.gravity is not None:
+        drive = multiply(actuated.mass, actuated.centre)
+        link = multiply(intermediate.mass, intermediate.centre)
+    stops = None
+    if scene.stroke.stiffness is not None:
+        arc = geometry.of_leg("arc", k)
+        stops = ElasticStops(arc, scene.stroke.stiffness, damping)
+    a0 = drive_zz + yy - xx
+    a2 = zz - yy + xx
+    springs = _springs_of(scene, k)
+    return Leg(
+        w=w,
+        v=v,
+        across=cross3(w, v),
+        e0=e0,
+        e1=e1,
+        a0=a0,
+        a2=a2,
+        ixy=xy,
+        ixz=xz,
+        iyz=yz,
+        friction=_friction_of(scene),
+        springs=springs,
+        drive=drive,
+        link=link,
+        stops=stops,
+    )
+
+
 def _friction_of(scene: Any) -> tuple[Friction | None, ...]:
-    """Return the friction of gamma, mu and beta."""
+    """Return the friction of gamma, mu and beta, None where a joint has none."""
     return tuple(getattr(scene.friction, name, None) for name in JOINT_NAMES)
 
 
@@ -173,7 +213,9 @@ def _springs_of(scene: Any, k: int) -> tuple[JointSpring | None, ...]:
     springs = []
     for name in JOINT_NAMES:
         joint = f"{name}_{k + 1}"
-        springs.append(_join([x for x in scene.springs if x.joint == joint]))
+        springs.append(
+            _join([spring for spring in scene.springs if spring.joint == joint])
+        )
     return tuple(springs)
 
 
@@ -196,9 +238,12 @@ def damping_of(stroke: Stroke) -> Any:
     if stroke.restitution is None or stroke.impact_rate is None:
         return stroke.damping
     e = stroke.restitution
-    many = isinstance(e, np.ndarray)
-    root = np.vectorize(_inverse_langevin) if many else _inverse_langevin
-    return 2.0 * root((1.0 - e) / (1.0 + e)) / ((1.0 + e) * stroke.impact_rate)
+    lost_share = (1.0 - e) / (1.0 + e)
+    if isinstance(e, np.ndarray):
+        half_s = np.vectorize(_inverse_langevin)(lost_share)
+    else:
+        half_s = _inverse_langevin(lost_share)
+    return 2.0 * half_s / ((1.0 + e) * stroke.impact_rate)
 
 
 def _inverse_langevin(y: float) -> float:
@@ -206,6 +251,8 @@ def _inverse_langevin(y: float) -> float:
     if y < 0.05:  # coth x - 1/x would cancel; the next term of the series is 2.1 y^13
         terms = enumerate(_INVERSE_LANGEVIN_SERIES)
         return sum(coefficient * y ** (2 * i + 1) for i, coefficient in terms)
+    # 1 - 1/x <= coth x - 1/x <= x/3; the upper end is widened, so that rounding cannot
+    # put it below the lower one.
     low = 3.0 * y
     high = 1.0 / (1.0 - y) + 3.0 * y
     while True:  # at most some sixty bisections
@@ -219,12 +266,12 @@ def _inverse_langevin(y: float) -> float:
 
 
 def _join(springs: list[Any]) -> JointSpring | None:
+    """Return springs of one joint as one; None where there are none."""
     if not springs:
         return None
     stiffness = sum(spring.stiffness for spring in springs)
-    return JointSpring(
-        stiffness, sum(s.stiffness * s.rest for s in springs) / stiffness
-    )
+    moment = sum(spring.stiffness * spring.rest for spring in springs)
+    return JointSpring(stiffness, moment / stiffness)
 
 
 class Limit(NamedTuple):
@@ -245,13 +292,13 @@ class Limit(NamedTuple):
 
     def slope(self, joints: Sequence[float]) -> float:
         """Rate of the distance [rad/s]."""
-        return self.sign * joints[self.joint + 9]
+        return self.sign * joints[self.joint + JOINT_COUNT]
 
 
 def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
-    """Joint, lower and upper end of what the limits allow.
+    """Return the joint, lower and upper end of each range that the limits leave.
 
-    Infinite where there is none.
+    An end is infinite where there is no limit.
     """
     ranges: dict[int, tuple[float, float]] = {}
     for limit in limits:
@@ -265,9 +312,9 @@ def ranges_of(limits: Sequence[Limit]) -> list[tuple[int, float, float]]:
 
 
 def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
-    """Yield serial singularities, and the ends at which the `Scene` stops.
+    """Yield the serial singularities, and the ends at which a scene's motion stops.
 
-    Of many geometries the ends are columns, which no text names.
+    The ends of many geometries are columns, whose numbers are in no message.
     """
 
     def above(name: str, end: Any) -> str:
@@ -275,9 +322,9 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
             return f"{name} > {end:.6f} rad"
         return f"{name} > its end"
 
-    for k in range(3):
+    for k in range(LEGS):
         singular = f"serial singularity, mu_{k + 1}"
-        mu = k + 3
+        mu = AT_MU * LEGS + k
         yield Limit(f"{singular} = 0", SingularityReached, mu, 1.0, SINGULAR_MU)
         most = math.pi - SINGULAR_MU
         yield Limit(f"{singular} = pi", SingularityReached, mu, -1.0, most)
@@ -288,7 +335,7 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
             yield Limit(above(name, arc), StrokeExceeded, k, -1.0, arc)
         if scene.workspace.at_edge == "stop":
             name = f"beta_{k + 1}"
-            beta = k + 6
+            beta = AT_BETA * LEGS + k
             edge = geometry.beta_max
             yield Limit(f"{name} < 0", WorkspaceLeft, beta, 1.0, 0.0)
             yield Limit(above(name, edge), WorkspaceLeft, beta, -1.0, edge)
@@ -297,7 +344,7 @@ def limits_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
 def contact_events_of(scene: Any, geometry: Geometry) -> Iterator[Limit]:
     """Yield begin and end of contact at a `Scene`'s elastic stops, a limit each."""
     if scene.stroke.at_end == "elastic":
-        for k in range(3):
+        for k in range(LEGS):
             for end in (0.0, float(geometry.arc[k])):
                 for sign in (1.0, -1.0):
                     yield Limit(f"gamma_{k + 1} = {end:.6f} rad", None, k, sign, end)
@@ -308,15 +355,14 @@ def free_range(events: Sequence[Limit]) -> list[Limit]:
     # Of the two events at each end: the one whose distance is positive inside.
     inner = [event for event in events if (event.end == 0.0) == (event.sign > 0.0)]
     return [
-        event._replace(end=event.end + 4.0 * CONTACT_BAND * event.sign)
-        for event in inner
+        event._replace(end=event.end + _FREE_BEYOND * event.sign) for event in inner
     ]
 
 
 class Transition(NamedTuple):
     """The rates of a joint within which its friction changes."""
 
-    rate: int  # place of the joint's rate among nine angles and nine rates
+    rate: int  # place of the joint's rate behind all angles
     edge: float  # magnitude from which the friction is constant [rad/s]
     width: float  # part of the range that a step may pass [rad/s]
 
@@ -330,15 +376,14 @@ def transitions_of(scene: Any, tolerance: float) -> tuple[Transition, ...]:
     edge = 0.5 * math.log(max(2.0 / tolerance, 1.0))
     if scene.friction is None or edge == 0.0:
         return ()
-    frictions = scene.friction.gamma, scene.friction.mu, scene.friction.beta
     transitions = []
-    for place, friction in enumerate(frictions):
+    for joint, friction in enumerate(_friction_of(scene)):
         if friction is None or not (friction.coulomb or friction.static):
             continue
         width = _STEP_WIDTH * friction.smoothing
         if width < _RESOLVED * tolerance:
             continue
-        for leg in range(3):
-            rate = 9 + 3 * place + leg  # the rates follow nine angles
+        for k in range(LEGS):
+            rate = JOINT_COUNT + joint * LEGS + k
             transitions.append(Transition(rate, edge * friction.smoothing, width))
     return tuple(transitions)

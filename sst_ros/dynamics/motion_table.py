@@ -109,13 +109,14 @@ class MotionTable(Explained, ReadOnly):
         table: pd.DataFrame = require("pandas").DataFrame(columns)
         units = {name: unit for name, (_, unit) in scenario_columns.items() if unit}
         table.attrs = {"units": MOTION_UNITS | units, "scene": self.scene.name}
-        table.index.name = None if self._axes == ("time",) else self._axes[-1]
+        if self._axes != ("time",):
+            table.index.name = self._axes[-1]
         return table
 
     def to_xarray(self) -> xr.Dataset:
-        """Arrays with the dimensions time, scenario, leg, axis and part.
+        """Return arrays with the dimensions time, scenario, leg, axis and part.
 
-        Needs xarray.
+        It needs xarray.
         """
         axes = self._axes
         arrays: dict[str, Any] = {}
@@ -123,17 +124,17 @@ class MotionTable(Explained, ReadOnly):
             arrays[name] = (*axes, dimension), getattr(self, name), {"units": unit}
         arrays["energy"] = axes, self.energy, {"units": "J"}
         for name, (values, unit) in self._of_each().items():
-            attributes = {"units": unit} if unit else {}
-            arrays[name] = "scenario", np.array(values), attributes
-        time = {"units": "s"}
+            units = {"units": unit} if unit else {}
+            arrays[name] = "scenario", np.array(values), units
+        seconds = {"units": "s"}
         if "scenario" in axes:
-            arrays["t"] = axes, self.t, time
+            arrays["t"] = axes, self.t, seconds
             coordinates: dict[str, Any] = {"scenario": np.arange(self.t.shape[-1])}
         else:
-            coordinates = {"time": ("time", self.t, time)}
-        about = {"scene": self.scene.name} | self._of_run()
+            coordinates = {"time": ("time", self.t, seconds)}
+        attributes = {"scene": self.scene.name} | self._of_run()
         dataset: xr.Dataset = require("xarray").Dataset(
-            arrays, coordinates | DIMENSIONS, about
+            arrays, coordinates | DIMENSIONS, attributes
         )
         return dataset
 

@@ -22,13 +22,17 @@ import numpy as np
 from sst_ros.errors import check_kinds, refusal, refuse_unless
 from sst_ros.mechanism import generic_math
 from sst_ros.mechanism.generic_math import Scalar
-from sst_ros.programs.expression import Expression, Program, trace
+from sst_ros.programs.expression import (
+    Expression,
+    Program,
+    constant_text,
+    references,
+    trace,
+)
 from sst_ros.scene.own_loads import (
-    ANGLE_NAMES,
     BODY_RATE,
     OMEGA,
     POSE_NAMES,
-    RATE_NAMES,
     ROTATION,
     STATE_NAMES,
     FormulaLoad,
@@ -65,11 +69,13 @@ class LoadConstants(NamedTuple):
 
 def load_constants(load: FormulaLoad) -> LoadConstants:
     """Collect what the dynamics need of an own load."""
-    names = tuple(parameter.name for parameter in load.parameters)
-    terms = tuple(dict(load.terms).items())
-    in_star = load.frame == "star"
     formula = LoadFormula(
-        load.name, names, terms, load.potential, tuple(load.moment), in_star
+        name=load.name,
+        parameters=tuple(parameter.name for parameter in load.parameters),
+        terms=tuple(dict(load.terms).items()),
+        potential=load.potential,
+        moment=tuple(load.moment),
+        in_star=load.frame == "star",
     )
     values = tuple(parameter.value for parameter in load.parameters)
     return LoadConstants(formula, values)
@@ -92,8 +98,8 @@ def load_program(formula: LoadFormula) -> LoadProgram:
 
     InputError where constants in it have no value.
     """
-    texts = [text for _, text in formula.terms] + [*formula.outputs]
-    used = names_in(iter(texts))
+    texts = [*dict(formula.terms).values(), *formula.outputs]
+    used = names_in(texts)
     quantities = tuple(name for name in STATE_NAMES if name in used)
     inputs = (*quantities, *formula.parameters)
 
@@ -127,12 +133,14 @@ def _evaluate(node: ast.expr, variables: Mapping[str, Any]) -> Any:
     assert isinstance(node, ast.BinOp)
     left = _evaluate(node.left, variables)
     if isinstance(node.op, ast.Pow):
-        return _raise(left, power_of(node) or 1)
+        power = power_of(node)
+        assert power is not None  # the formula has been checked
+        return _raise(left, power)
     return _OPERATOR_FUNCTIONS[type(node.op)](left, _evaluate(node.right, variables))
 
 
 def _raise(base: Any, power: int) -> Any:
-    """Return a whole power as products."""
+    """Return a whole power, not zero, as products."""
     result = base
     for _ in range(abs(power) - 1):
         result = result * base
@@ -147,11 +155,11 @@ def _tangent(x: Any) -> Any:
     return generic_math.sin(x) / generic_math.cos(x)
 
 
-def _least(x: Any, y: Any) -> Any:
+def _smaller(x: Any, y: Any) -> Any:
     return x - generic_math.positive(x - y)
 
 
-def _largest(x: Any, y: Any) -> Any:
+def _larger(x: Any, y: Any) -> Any:
     return x + generic_math.positive(y - x)
 
 
@@ -171,8 +179,8 @@ _CALL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "positive": generic_math.positive,
     "tan": _tangent,
     "abs": _absolute,
-    "min": _least,
-    "max": _largest,
+    "min": _smaller,
+    "max": _larger,
 }
 
 
@@ -192,10 +200,13 @@ _STEP_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "div": operator.truediv,
     "neg": operator.neg,
     "step": _step,
-    **{
-        name: _CALL_FUNCTIONS[name]
-        for name in ("sqrt", "exp", "sin", "cos", "tanh", "atan2", "positive")
-    },
+    "sqrt": generic_math.sqrt,
+    "exp": generic_math.exp,
+    "sin": generic_math.sin,
+    "cos": generic_math.cos,
+    "tanh": generic_math.tanh,
+    "atan2": generic_math.atan2,
+    "positive": generic_math.positive,
 }
 
 
@@ -344,16 +355,19 @@ class LoadState:
                 return None
             return np.array([symbols[name] for name in names], dtype=object)
 
+        def of_legs(quantity: str) -> Any:
+            return array([f"{quantity}_{leg}" for leg in (1, 2, 3)])
+
         return cls(
             rotation=array(ROTATION).reshape(3, 3),
-            gamma=array(ANGLE_NAMES[0:3]),
-            mu=array(ANGLE_NAMES[3:6]),
-            beta=array(ANGLE_NAMES[6:9]),
+            gamma=of_legs("gamma"),
+            mu=of_legs("mu"),
+            beta=of_legs("beta"),
             omega=array(OMEGA),
             body_rate=array(BODY_RATE),
-            gamma_dot=array(RATE_NAMES[0:3]),
-            mu_dot=array(RATE_NAMES[3:6]),
-            beta_dot=array(RATE_NAMES[6:9]),
+            gamma_dot=of_legs("gamma_dot"),
+            mu_dot=of_legs("mu_dot"),
+            beta_dot=of_legs("beta_dot"),
         )
 
 
@@ -384,7 +398,7 @@ def own_load(
 
     Raises:
         InputError: a function decides by a number of the state or does more than
-            formulas can, or a formula is none.
+            formulas can, or a text is no formula.
 
     """
     parameter_values = dict(parameters or {})
@@ -397,15 +411,15 @@ def own_load(
         LoadParameter(name=key, value=x) for key, x in parameter_values.items()
     )
     if callable(potential):
-        document["terms"], (energy,) = _write(
+        terms, (energy,) = _write(
             potential, parameter_values, POSE_NAMES, 1, "potential"
         )
+        document["terms"] = terms
         document["potential"] = energy
     elif callable(moment):
-        document["terms"], texts = _write(
-            moment, parameter_values, STATE_NAMES, 3, "moment"
-        )
-        document["moment"] = texts
+        terms, moments = _write(moment, parameter_values, STATE_NAMES, 3, "moment")
+        document["terms"] = terms
+        document["moment"] = moments
     elif potential is not None:
         document["potential"] = potential
     else:
@@ -424,10 +438,7 @@ def _write(
     inputs = (*names, *parameters)
 
     def run(*values: Expression) -> list[Any]:
-        symbols = {
-            name: Symbol(value) for name, value in zip(inputs, values, strict=True)
-        }
-
+        symbols = dict(zip(inputs, map(Symbol, values), strict=True))
         state = LoadState.of(symbols)
         result = function(state, **{name: symbols[name] for name in parameters})
         numbers = [result] if count == 1 else list(result)
@@ -450,12 +461,11 @@ def write_formulas(
 
     The terms are what is used more than once.
     """
-    first = len(program.inputs)
+    first = len(program.inputs)  # number of the first step
     uses = [0] * (first + len(program.steps))
     for _, operands in program.steps:
-        for operand in operands:
-            if isinstance(operand, int):
-                uses[operand] += 1
+        for number in references(operands):
+            uses[number] += 1
     prefix = "s"
     while any(name.startswith(prefix) for name in program.inputs):
         prefix += "_"
@@ -465,7 +475,7 @@ def write_formulas(
     def operand_text(operand: float | int) -> str:
         if isinstance(operand, int):
             return value_texts[operand]
-        return repr(operand) if operand >= 0.0 else f"({operand!r})"
+        return constant_text(operand)
 
     for index, (operation, operands) in enumerate(program.steps, start=first):
         assert isinstance(operation, str)  # no routine: a load has none
@@ -479,7 +489,7 @@ def write_formulas(
     return tuple(terms.items()), tuple(map(operand_text, program.outputs))
 
 
-_LONG = 200  # characters after which a formula continues in another term
+_LONG = 200  # characters after which a formula continues in another term: readable
 _FORMS = {
     "add": "({} + {})",
     "sub": "({} - {})",

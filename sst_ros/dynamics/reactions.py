@@ -33,13 +33,15 @@ import numpy as np
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.kernel import LegMotion
-from sst_ros.dynamics.model import Model
+from sst_ros.dynamics.model import LEGS, Model, actuated_inertia
 from sst_ros.dynamics.traced_dynamics import (
     BODY_ACCELERATION,
     MOTION,
+    STATE_SIZE,
     TORQUE_SYMBOLS,
     Dynamics,
     Function,
+    parameter_symbols,
 )
 from sst_ros.errors import require
 from sst_ros.mechanism.generic_math import (
@@ -53,20 +55,23 @@ from sst_ros.mechanism.generic_math import (
     rotate_back,
     rotation_rows,
     sqrt,
+    subtract,
     symmetric_rows,
+    transform,
     triple,
 )
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.expression import (
     compile_for_arrays,
     compile_program,
+    divide,
     mark_present,
     trace,
 )
 from sst_ros.scene.bodies import entries_of
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import leaves, rebuild
-from sst_ros.state import ZERO, Explained, cached_property
+from sst_ros.state import STAR_RATE, ZERO, Explained, cached_property
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -221,13 +226,13 @@ def load_figures(t: Array, values: Array) -> LoadFigures:
     size = np.abs(values)
     row = np.nanargmax(np.where(np.isnan(size), -1.0, size), axis=0)
     peak = np.take_along_axis(size, row[None], axis=0)[0]
-    times = np.broadcast_to(
-        t.reshape(*t.shape, *[1] * (values.ndim - t.ndim)), values.shape
-    )
+    value_axes = tuple(range(t.ndim, values.ndim))
+    times = np.broadcast_to(np.expand_dims(t, value_axes), values.shape)
     when = np.take_along_axis(times, row[None], axis=0)[0]
     span = times[-1] - times[0]
     intervals = np.diff(times, axis=0)
     first, last = values[:-1], values[1:]
+    # three times the mean square of the line between two samples
     integrand = first * first + first * last + last * last
     squares = np.sum(intervals * integrand, axis=0) / 3.0
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -252,19 +257,20 @@ def reactions_of(
             (n, 3).
 
     """
-    state = (*quaternion.T, *body_rate.T)
+    x, y, z, w = quaternion.T
+    state = (x, y, z, w, *body_rate.T)
     with np.errstate(all="ignore"):
         legs = _legs(scene, Dynamics.of(scene).model, state, triple(torque.T))
-    return _collect(t, _flatten(legs), rotation_rows(_quadruple(state)))
+    return _collect(t, _flatten(legs), rotation_rows((x, y, z, w)))
 
 
 def reaction_at(scene: Scene, joint: str, leg: int) -> Function:
     """Return a function for what one joint exerts on the link that is nearer the star.
 
-    It gives force through O [N] and moment about O [N m], six numbers in the axes of
-    the joint's frame, see `JointLoads`. Its arguments are the quaternion (x, y, z, w),
-    the body rate [rad/s], the torques that act at the actuators [N m] and the angular
-    acceleration in {E} [rad/s^2], 13 numbers.
+    Its six results are the force through O [N] and the moment about O [N m] in the axes
+    of the joint's frame, see `JointLoads`. Its 13 arguments are the quaternion
+    (x, y, z, w), the body rate [rad/s], the torques that act at the actuators [N m] and
+    the angular acceleration in {E} [rad/s^2].
 
     Args:
         scene: what moves.
@@ -275,8 +281,9 @@ def reaction_at(scene: Scene, joint: str, leg: int) -> Function:
     model = Dynamics.of(scene).model
 
     def wrench(*inputs: Any) -> tuple[Scalar, ...]:
-        torque, acceleration = triple(inputs[7:10]), triple(inputs[10:13])
-        legs = _solve(scene, model, inputs[:7], acceleration, torque)
+        state, drive = inputs[:STATE_SIZE], inputs[STATE_SIZE:]
+        torque, acceleration = triple(drive[:LEGS]), triple(drive[LEGS:])
+        legs = _solve(scene, model, state, acceleration, torque)
         force, moment = getattr(legs[leg], joint)
         return (*force, *moment)
 
@@ -301,15 +308,15 @@ class ScenarioReactions:
             place: x for place, x in numbers.items() if isinstance(x, np.ndarray)
         }
         self._columns = list(columns.values())
-        names = (*MOTION, *TORQUE_SYMBOLS, *(f"p{i}" for i in range(len(columns))))
+        names = (*MOTION, *TORQUE_SYMBOLS, *parameter_symbols(len(columns)))
 
         def run(*inputs: Any) -> list[Any]:
-            marked = map(mark_present, inputs[10:])
-            symbols = dict(zip(columns, marked, strict=True))
+            sizes = {"state": STATE_SIZE, "torque": LEGS, "columns": len(columns)}
+            of = divide(sizes, inputs)
+            symbols = dict(zip(columns, map(mark_present, of["columns"]), strict=True))
             own_scene, own_model = rebuild(tree, symbols)
-            return _flatten(
-                _legs(own_scene, own_model, inputs[:7], triple(inputs[7:10]))
-            )
+            torque = triple(of["torque"])
+            return _flatten(_legs(own_scene, own_model, of["state"], torque))
 
         self._run = compile_for_arrays(trace(run, names))
 
@@ -323,16 +330,17 @@ class ScenarioReactions:
             numbers = self._run(
                 *state, *torque, *(column[rows] for column in self._columns)
             )
-        return _collect(t, list(numbers), rotation_rows(_quadruple(list(state))))
+        q, _ = kernel.split_motion(list(state))
+        return _collect(t, list(numbers), rotation_rows(q))
 
 
 def _legs(
     scene: Any, model: Model, state: Sequence[Scalar], torque: Triple
 ) -> list[_LegReactions]:
     """Solve for the reactions of the legs under torques that act."""
-    still = model._replace(time_constant=None)
-    slope = kernel.derivative(still, tuple(state), torque)
-    return _solve(scene, model, state, triple(slope[4:7]), torque)
+    without_lag = model._replace(time_constant=None)  # these torques act already
+    slope = kernel.derivative(without_lag, tuple(state), torque)
+    return _solve(scene, model, state, triple(slope[STAR_RATE]), torque)
 
 
 def _flatten(tree: Any) -> list[Scalar]:
@@ -344,37 +352,57 @@ def _flatten(tree: Any) -> list[Scalar]:
 
 def _collect(t: Array, numbers: Sequence[Scalar], rows: Rows) -> Reactions:
     """Make reactions of the 36 numbers of each leg, which `_flatten` lists."""
-    flat = _stack(t, numbers).reshape(*t.shape, 3, 12, 3)
+    of_legs = _stack(t, numbers).reshape(*t.shape, LEGS, -1, 3)
+    # First a force and a moment of each joint, then the axes of both frames in {E}.
+    wrench_rows = 2 * len(LINK_JOINTS)
+    wrenches, axes = np.split(of_legs, [wrench_rows], axis=-2)
     joints: dict[str, Any] = {}
     for index, name in enumerate(LINK_JOINTS):
-        force, moment = flat[..., 2 * index, :], flat[..., 2 * index + 1, :]
+        force = wrenches[..., 2 * index, :]
+        moment = wrenches[..., 2 * index + 1, :]
         joints[name] = JointLoads(force, moment, AXES[name])
-    # Rows of the frames are their axes in {E}.
-    axes = flat[..., 6:, :].reshape(*t.shape, 3, 2, 3, 3)
-    frames = _stack(t, rows)[..., None, None, :, :] @ np.swapaxes(axes, -1, -2)
+    by_frame = axes.reshape(*t.shape, LEGS, 2, 3, 3)
+    frames = _stack(t, rows)[..., None, None, :, :] @ np.swapaxes(by_frame, -1, -2)
     frames.setflags(write=False)
     first, second = frames[..., 0, :, :], frames[..., 1, :, :]
     return Reactions(t=t, **joints, actuated_frames=first, intermediate_frames=second)
 
 
-class _LegReactions(NamedTuple):
-    """Forces and moments of a leg in the frames of the joints.
+class _Wrench(NamedTuple):
+    """A force through O [N] and a moment about O [N m]."""
 
-    Axes of {1k} and {2k} in {E}.
+    force: Triple
+    moment: Triple
+
+    def plus(self, wrench: _Wrench) -> _Wrench:
+        """Return the sum of two wrenches."""
+        force = add(self.force, wrench.force)
+        return _Wrench(force, add(self.moment, wrench.moment))
+
+    def along(self, axes: Rows) -> _Wrench:
+        """Return the components along axes."""
+        return _Wrench(transform(axes, self.force), transform(axes, self.moment))
+
+
+class _LegReactions(NamedTuple):
+    """What the joints of a leg transmit, in the axes of their frames.
+
+    Then the axes of {1k} and {2k} in {E}.
     """
 
-    actuated: tuple[Triple, Triple]
-    revolute: tuple[Triple, Triple]
-    prismatic: tuple[Triple, Triple]
+    actuated: _Wrench
+    revolute: _Wrench
+    prismatic: _Wrench
     first: Rows
     second: Rows
 
 
-class _Change(NamedTuple):
-    """What a link needs in {E}: force, and moment about O, less those of its weight."""
+class _Turning(NamedTuple):
+    """How a body turns, and the field that it is in, in {E}."""
 
-    force: Triple
-    moment: Triple
+    field: Triple  # acceleration of free fall [m/s^2]
+    rate: Triple  # angular velocity [rad/s]
+    acceleration: Triple  # angular acceleration [rad/s^2]
 
 
 def _solve(
@@ -385,24 +413,27 @@ def _solve(
     torque: Triple,
 ) -> list[_LegReactions]:
     """Solve the balances of all links, leg by leg, in {E}."""
-    rows, rate = rotation_rows(_quadruple(state)), triple(state[4:7])
+    q, rate = kernel.split_motion(state)
+    rows = rotation_rows(q)
     field = ZERO if model.gravity is None else rotate_back(rows, model.gravity)
+    turning = _Turning(field, rate, acceleration)
     motions = list(kernel.leg_motions(model, state))
     own = kernel.own_torques(model, rows, rate) if model.own_loads else None
-    star = _change_of_star(scene, model, field, rate, acceleration)
+    star = _star_needs(scene, model, turning)
     legs = []
     for k, (motion, drive) in enumerate(zip(motions, torque, strict=True)):
         loads = _joint_loads(motion)
         if own is not None:
             loads = add(loads, own.joints[k])
-        legs.append(_Leg.of(scene, k, motion, field, rate, acceleration, drive, loads))
+        legs.append(_Leg.of(scene, k, motion, turning, drive, loads))
     # Least sum of squares of the forces x, x + b and x + b + a of each leg, whose x
     # make up the star's: 3 x + 2 b + a is the same in all legs.
     spread = [add(multiply(2.0, leg.link.force), leg.drive.force) for leg in legs]
-    mean = multiply(1.0 / 3.0, add(add(spread[0], spread[1]), spread[2]))
+    first, second, third = spread
+    mean = multiply(1.0 / 3.0, add(add(first, second), third))
     reactions = []
     for leg, own_spread in zip(legs, spread, strict=True):
-        share = add(star.force, _subtract(mean, own_spread))
+        share = add(star.force, subtract(mean, own_spread))
         reactions.append(leg.express(multiply(1.0 / 3.0, share)))
     return reactions
 
@@ -412,8 +443,8 @@ class _Leg(NamedTuple):
 
     first: Rows
     second: Rows
-    drive: _Change
-    link: _Change
+    drive: _Wrench
+    link: _Wrench
     moment: Triple
 
     @classmethod
@@ -422,9 +453,7 @@ class _Leg(NamedTuple):
         scene: Any,
         k: int,
         motion: LegMotion,
-        field: Triple,
-        rate: Triple,
-        acceleration: Triple,
+        star: _Turning,
         torque: Scalar,
         loads: Triple,
     ) -> _Leg:
@@ -434,139 +463,105 @@ class _Leg(NamedTuple):
         t = motion.along
         w = motion.axis
         across = cross3(w, r)
-        first, second = (r, across, w), (r, cross3(t, r), t)
-        _, gamma_rest = kernel.rest_accelerations(motion, rate)
-        gamma_ddot = dot3(motion.g, acceleration) + gamma_rest
+        first = (r, across, w)
+        second = (r, cross3(t, r), t)
+        _, gamma_rest = kernel.rest_accelerations(motion, star.rate)
+        gamma_ddot = dot3(motion.g, star.acceleration) + gamma_rest
         mu_dot = -motion.a_dot / root
-        turning = cross3(rate, t)
-        products = motion.gamma_dot * mu_dot + motion.beta_dot * dot3(across, turning)
-        beta_ddot = -(dot3(across, acceleration) + products) / root  # Eq. 46
+        t_dot = cross3(star.rate, t)
+        products = motion.gamma_dot * mu_dot + motion.beta_dot * dot3(across, t_dot)
+        beta_ddot = -(dot3(across, star.acceleration) + products) / root  # Eq. 46
         # omega of the star is that of the intermediate link - t beta_dot, and t turns
         # with it.
-        slide = add(multiply(beta_ddot, t), multiply(motion.beta_dot, turning))
-        link_rate = add(rate, multiply(motion.beta_dot, t))
+        slide = add(multiply(beta_ddot, t), multiply(motion.beta_dot, t_dot))
+        link_turning = _Turning(
+            field=star.field,
+            rate=add(star.rate, multiply(motion.beta_dot, t)),
+            acceleration=add(star.acceleration, slide),
+        )
         link = scene.intermediate_links[k]
-        link_change = _change_of(
-            entries_of(link.inertia), link.mass, link.centre, second, field,
-            link_rate, add(acceleration, slide),
-        )  # fmt: skip
+        link_needs = _link_needs(link, entries_of(link.inertia), second, link_turning)
+        inertia = actuated_inertia(scene, k)
+        drive_turning = _Turning(
+            field=star.field,
+            rate=multiply(motion.gamma_dot, w),
+            acceleration=multiply(gamma_ddot, w),
+        )
         drive = scene.actuated_links[k]
-        inertia = entries_of(drive.inertia)
-        if scene.actuators is not None:
-            gear = scene.actuators.gear_ratio
-            inertia[2] = inertia[2] + gear * gear * scene.actuators.rotor_inertia
-        drive_change = _change_of(
-            inertia, drive.mass, drive.centre, first, field,
-            multiply(motion.gamma_dot, w), multiply(gamma_ddot, w),
-        )  # fmt: skip
+        drive_needs = _link_needs(drive, inertia, first, drive_turning)
         at_gamma, at_mu, at_beta = loads
-        needs = link_change.moment
+        needs = link_needs.moment
         along_t = -at_beta
         along_r = -at_mu - dot3(r, needs)
-        along_w = torque + at_gamma - dot3(w, add(needs, drive_change.moment))
+        along_w = torque + at_gamma - dot3(w, add(needs, drive_needs.moment))
         normal = cross3(r, t)
         along_normal = (along_w - motion.a * along_t) / root
         moment = add(multiply(along_r, r), multiply(along_normal, normal))
         moment = add(moment, multiply(along_t, t))
-        return cls(first, second, drive_change, link_change, moment)
+        return cls(first, second, drive_needs, link_needs, moment)
 
     def express(self, force: Triple) -> _LegReactions:
         """Return what the joints transmit if the leg exerts this force on the star."""
-        on_link = add(force, self.link.force), add(self.moment, self.link.moment)
-        on_drive = add(on_link[0], self.drive.force), add(on_link[1], self.drive.moment)
+        on_star = _Wrench(force, self.moment)
+        on_link = on_star.plus(self.link)
+        on_drive = on_link.plus(self.drive)
         return _LegReactions(
-            (
-                _components(on_drive[0], self.first),
-                _components(on_drive[1], self.first),
-            ),
-            (
-                _components(on_link[0], self.second),
-                _components(on_link[1], self.second),
-            ),
-            (_components(force, self.second), _components(self.moment, self.second)),
-            self.first,
-            self.second,
+            actuated=on_drive.along(self.first),
+            revolute=on_link.along(self.second),
+            prismatic=on_star.along(self.second),
+            first=self.first,
+            second=self.second,
         )
 
 
 def _joint_loads(motion: LegMotion) -> Triple:
-    """Torques of friction, springs and stops at gamma, mu and beta [N m].
-
-    Weights are left out.
-    """
+    """Torques of friction, springs and stops, not of weights, at the joints [N m]."""
     weightless = motion._replace(leg=motion.leg._replace(drive=ZERO, link=ZERO))
     return kernel.joint_torques(weightless, ZERO)
 
 
-def _change_of_star(
-    scene: Any, model: Model, field: Triple, rate: Triple, acceleration: Triple
-) -> _Change:
+def _star_needs(scene: Any, model: Model, turning: _Turning) -> _Wrench:
     """Return what the star with its payload needs; its frame is {E}."""
-    entries, mass = entries_of(scene.star.inertia), scene.star.mass
+    entries = entries_of(scene.star.inertia)
+    mass = scene.star.mass
     if scene.payload is not None:
         pairs = zip(entries, scene.payload.entries, strict=True)
         entries = [own + carried for own, carried in pairs]
         mass = mass + scene.payload.mass
     axes: Rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    weight = model.weight
-    return _change(entries, mass, weight, axes, field, rate, acceleration)
+    return _needs(entries, mass, model.weight, axes, turning)
 
 
-def _change_of(
-    inertia: Sequence[Scalar],
-    mass: Scalar,
-    centre: Triple,
-    axes: Rows,
-    field: Triple,
-    rate: Triple,
-    acceleration: Triple,
-) -> _Change:
-    """Return what a link needs whose centre is given in its own axes."""
-    weight = _combine(multiply(mass, centre), axes)
-    return _change(inertia, mass, weight, axes, field, rate, acceleration)
+def _link_needs(
+    link: Any, inertia: Sequence[Scalar], axes: Rows, turning: _Turning
+) -> _Wrench:
+    """Return what a link with this inertia needs; its centre is in its own axes."""
+    weight = rotate_back(axes, multiply(link.mass, link.centre))
+    return _needs(inertia, link.mass, weight, axes, turning)
 
 
-def _change(
+def _needs(
     inertia: Sequence[Scalar],
     mass: Scalar,
     weight: Triple,
     axes: Rows,
-    field: Triple,
-    rate: Triple,
-    acceleration: Triple,
-) -> _Change:
-    """Return Newton's and Euler's sides of a body that turns about O, less its weight.
+    turning: _Turning,
+) -> _Wrench:
+    """Return the rates of change of a body's momenta, less what its weight does.
 
-    Inertia (xx, yy, zz, xy, xz, yz) is about O in the axes of the body; mass times
-    centre, gravity, rate and acceleration are in {E}.
+    The body turns about O. Its inertia (xx, yy, zz, xy, xz, yz) is about O in its own
+    axes; `weight`, mass times centre, is in {E}.
     """
+    field, rate, acceleration = turning
     xx, yy, zz, xy, xz, yz = inertia
     tensor = symmetric_rows((xx, yy, zz, xy, xz, yz))
-    spin, spin_dot = _components(rate, axes), _components(acceleration, axes)
-    momentum = triple(dot3(row, spin) for row in tensor)
-    change = add(triple(dot3(row, spin_dot) for row in tensor), cross3(spin, momentum))
-    moment = _subtract(_combine(change, axes), cross3(weight, field))
+    spin = transform(axes, rate)
+    spin_dot = transform(axes, acceleration)
+    momentum = transform(tensor, spin)
+    change = add(transform(tensor, spin_dot), cross3(spin, momentum))
+    moment = subtract(rotate_back(axes, change), cross3(weight, field))
     towards = add(cross3(acceleration, weight), cross3(rate, cross3(rate, weight)))
-    return _Change(_subtract(towards, multiply(mass, field)), moment)
-
-
-def _components(vector: Triple, axes: Rows) -> Triple:
-    return triple(dot3(axis, vector) for axis in axes)
-
-
-def _combine(components: Triple, axes: Rows) -> Triple:
-    x, y, z = axes
-    a, b, c = components
-    return triple(a * x[i] + b * y[i] + c * z[i] for i in range(3))
-
-
-def _subtract(a: Triple, b: Triple) -> Triple:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-
-
-def _quadruple(state: Sequence[Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    x, y, z, w = state[:4]
-    return x, y, z, w
+    return _Wrench(subtract(towards, multiply(mass, field)), moment)
 
 
 def _length(vectors: Array) -> Array:

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_ros.dynamics import kernel
-from sst_ros.dynamics.model import Limit, limits_of
+from sst_ros.dynamics.model import AT_MU, Limit, limits_of
+from sst_ros.dynamics.model import LEGS as LEGS
 from sst_ros.errors import Check, refuse_unless
 from sst_ros.mechanism.generic_math import Scalar, positive, sin, symmetric_rows, triple
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -39,7 +40,7 @@ from sst_ros.programs.expression import (
 from sst_ros.scene.scene import Scenarios, Scene
 from sst_ros.scene.schema import Place, leaves, rebuild
 from sst_ros.scene.torque_profile import SineTorque
-from sst_ros.state import ZERO, Joints, cached_property
+from sst_ros.state import MOMENT, STAR_RATE, TORQUES, ZERO, Joints, cached_property
 
 Function = Callable[..., Sequence[float]]
 
@@ -52,7 +53,12 @@ MOMENT_SYMBOLS = ("n1", "n2", "n3")
 BODY_ACCELERATION = ("ax", "ay", "az")
 
 STATE_SIZE = len(MOTION)  # of a state without lagged torques
-LEGS = 3
+
+
+def parameter_symbols(count: int) -> tuple[str, ...]:
+    """Return symbols of numbers that are inputs of a program."""
+    return tuple(f"p{i}" for i in range(count))
+
 
 DYNAMICS_OUTPUTS = (*Joints._fields, "energy")
 """Quantities of a state that depend on the numbers of its scenario."""
@@ -78,7 +84,7 @@ class Dynamics:
 
     @staticmethod
     def of(scene: Scene) -> Dynamics:
-        """Return those of a scene: traced once for all scenes of the same constants."""
+        """Return those of a scene; scenes of the same constants share them."""
         has_moment_topic = scene.moment is not None and scene.moment.topic
         return recent(kernel.model_of(scene), has_moment_topic=has_moment_topic)
 
@@ -91,8 +97,7 @@ class Dynamics:
     def joints(self) -> Function:
         """Angles gamma, mu and beta, and rates in the same order, 18 numbers.
 
-        They depend on the first seven of the state, and are nan where an angle has no
-        value.
+        They depend on quaternion and body rate; an angle without a value is nan.
         """
         return compile_functions({"joints": self.joints_program}, ("joints",))["joints"]
 
@@ -181,12 +186,13 @@ class Dynamics:
         """
         program = self._actuator_motion_program
         size = len(self.state)
-        numbers = 2 * (size - 1)  # x and its rates: a quaternion is three coordinates
-        by_number = [
-            program.outputs[numbers * k : numbers * (k + 1)] for k in range(1, size + 1)
-        ]
-        coordinates = [output for row in by_number for output in row[: size - 1]]
-        return compile_program(program.prune(coordinates))
+        coordinates = size - 1  # x: a quaternion is three coordinates
+        row_size = 2 * coordinates  # of x and its rates
+        slopes: list[float | int] = []
+        for number in range(1, size + 1):  # the values themselves come before the rows
+            begin = number * row_size
+            slopes += program.outputs[begin : begin + coordinates]
+        return compile_program(program.prune(slopes))
 
     @cached_property
     def _actuator_motion_program(self) -> Program:
@@ -198,7 +204,7 @@ class Dynamics:
             slope = kernel.derivative(
                 self.model, state, torque, triple(moment) if moment else None
             )
-            body_acceleration = triple(slope[len(QUATERNION_SYMBOLS) : STATE_SIZE])
+            body_acceleration = triple(slope[STAR_RATE])
             gamma_ddot = kernel.actuator_acceleration(
                 self.model, state, body_acceleration
             )
@@ -239,9 +245,9 @@ recent = lru_cache(maxsize=32)(Dynamics)
 class ODE:
     """Derivative of a scene's state, as programs with inputs t, `state`, `drive`.
 
-    These are those of `dynamics`, with these differences: `torque` over time, clamped
-    to `limit` [N m], replaces the torques of the drive; with `phases` the drive keeps
-    three numbers for them, the phases [rad]. `work` appends to the state the work [J]
+    State and drive are those of `dynamics`, with these differences: `torque` over time,
+    clamped to `limit` [N m], replaces the torques of the drive; with `phases` the drive
+    has the three phases [rad] in their place. `work` appends to the state the work [J]
     that actuators and moments have put in, less what friction has taken out.
     """
 
@@ -262,7 +268,7 @@ class ODE:
         self.state = (*dynamics.state, "work") if work else dynamics.state
         self.drive = dynamics.drive
         if torque is not None and not phases:
-            self.drive = dynamics.drive[LEGS:]
+            self.drive = dynamics.drive[MOMENT]
         self._inputs = ("t", *self.state, *self.drive)
         self._of_numbers = partial(self.derivative, numbered=True)
 
@@ -277,11 +283,7 @@ class ODE:
         return trace(self._of_numbers, self._inputs, ("t", *self.state))
 
     def eigenvalues(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
-        """Return the eigenvalues of the exact Jacobian [1/s], shape (size,).
-
-        It is that at a time [s], a state and a drive. Raises ArithmeticError where the
-        Jacobian is not finite.
-        """
+        """Return the eigenvalues of `matrix` [1/s], shape (size,)."""
         return np.asarray(np.linalg.eigvals(self.matrix(t, y, d)))
 
     def matrix(self, t: float, y: Sequence[float], d: Sequence[float]) -> Array:
@@ -290,11 +292,11 @@ class ODE:
         Raises ArithmeticError where it is not finite.
         """
         size = len(self.state)
-        # The derivative and its slopes by t come first, then those by the state.
-        flat = np.array(self.linearised(t, *y, *d)[2 * size :])
-        if not np.isfinite(flat).all():
+        first = 2 * size  # of the slopes by state, behind the derivative and that by t
+        slopes = np.array(self.linearised(t, *y, *d)[first:])
+        if not np.isfinite(slopes).all():
             raise ArithmeticError("the Jacobian is not finite")
-        return np.asarray(flat.reshape(size, size).T, dtype=float)
+        return np.asarray(slopes.reshape(size, size).T, dtype=float)
 
     @cached_property
     def slope(self) -> Function:
@@ -330,7 +332,8 @@ class ODE:
     ) -> tuple[Any, ...]:
         """Return the derivative at a time, a state and a drive of any kind.
 
-        If `numbered` it is that of constants that may be others in another scene.
+        With `numbered` its constants are each a `Number`, which another scene may have
+        another value of.
         """
         model = self.dynamics.model
         sine = self._torque
@@ -341,11 +344,12 @@ class ODE:
             limit = number_constants(limit, ("limit",))
         state = inputs[: len(self.dynamics.state)]
         drive = inputs[len(self.state) :]
-        torque, moment = drive[:LEGS], drive[LEGS:]
+        torque, moment = drive[TORQUES], drive[MOMENT]
         if sine is not None:
             phase = torque
             if not self._phases:
-                phase, moment = sine.phase, drive
+                phase = sine.phase
+                moment = drive
             rows = zip(sine.amplitude, sine.frequency, phase, strict=True)
             torque = tuple(a * sin(f * time + p) for a, f, p in rows)
             if limit is not None:
@@ -377,11 +381,12 @@ def limit_distances(
     the end of each limit; the state is quaternion and body rate.
     """
     legs = list(kernel.leg_motions(model, state))
-    distances, rates = [], []
+    distances = []
+    rates = []
     for limit, (cosine, sine) in zip(limits, ends, strict=True):
         joint, number = divmod(limit.joint, LEGS)
         leg = legs[number]
-        if joint == 1:  # sin(mu)^2 - sin(end)^2
+        if joint == AT_MU:  # sin(mu)^2 - sin(end)^2
             distance = leg.u - sine * sine
             rate = -2.0 * leg.a * leg.a_dot
         else:  # sqrt(u) sin(sign * (angle - end))
@@ -433,7 +438,7 @@ class ParametricModel:
                 self._varied.append(place)
             else:
                 self._fixed[place] = float(np.ravel(number)[0])
-        self.names = tuple(f"p{i}" for i in range(len(self._varied)))
+        self.names = parameter_symbols(len(self._varied))
         self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -451,19 +456,20 @@ class ParametricModel:
         inputs = np.empty((len(self._varied), len(geometry_index)))
         for row, place in zip(inputs, self._varied, strict=True):
             row[:] = numbers[place]
-            if place[-1] == "static":
+            *section, name = place
+            if name == "static":
                 # static = 0 is no breakaway torque, which is as if it were the Coulomb
                 # torque.
-                level: Place = (*place[:-1], "coulomb")
+                level: Place = (*section, "coulomb")
                 row[:] = np.where(row == 0.0, numbers[level], row)
-            elif place[-1] == "rest":
-                # of a spring without stiffness any will do
+            elif name == "rest":
+                # A spring without stiffness has none, and any number will do.
                 np.nan_to_num(row, copy=False)
         torque_limit = getattr(scenarios.columns().actuators, "torque_limit", None)
         if torque_limit is None:
             torque_limit = np.inf
         limit = np.full(len(geometry_index), torque_limit)
-        limit[limit == 0.0] = np.inf  # of actuators that are left out
+        limit[limit == 0.0] = np.inf  # zero: the scenario has no limit
         all_lag = not np.any(tree.model.time_constant == 0.0)
         requirement = "must be > 0 [s] in every scenario, or in none"
         checks: list[Check] = [("actuators.time_constant", 0.0, all_lag, requirement)]
@@ -493,7 +499,7 @@ class ParametricModel:
 
     @cached_property
     def limit_distances(self) -> Program:
-        """Distances to the limits, and their rates, of state (7) and varied numbers."""
+        """Distances to the limits and their rates; inputs MOTION and varied numbers."""
         return trace(self.distances, (*MOTION, *self.names))
 
     def distances(self, *inputs: Any) -> tuple[Scalar, ...]:
@@ -542,14 +548,14 @@ class ParametricModel:
     ) -> tuple[Constants, Geometry, NDArray[np.intp]]:
         """Return constants of scenarios, as columns, and their distinct geometries.
 
-        The last of the three is the index of the geometry of each row.
+        The last of the three results is the index of each row's geometry.
         """
         geometries, geometry_index = Geometry.of_scenarios(scenarios)
         geometry = geometries.of_rows(geometry_index)
         columns = scenarios.columns()
         limits = limits_of(self.scene, geometry)
         ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
-        # 0/0: the rest of springs without stiffness
+        # The rest of springs without stiffness is 0/0.
         with np.errstate(invalid="ignore"):
             model = kernel.model_of(columns, geometry)
         torque = columns.torque if self.profile else None
@@ -557,7 +563,7 @@ class ParametricModel:
 
 
 def _check_limit(scenarios: Scenarios, torque: SineTorque, limit: Array) -> Check:
-    """Return whether actuators can give a profile.
+    """Return the check that actuators can give a profile in all scenarios.
 
     A fixed step does not resolve the kinks of a clamped torque.
     """

@@ -27,7 +27,14 @@ import numpy as np
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.initial_state import initial_state
 from sst_ros.dynamics.model import damping_of
-from sst_ros.dynamics.traced_dynamics import MOTION, TORQUE_SYMBOLS, Dynamics
+from sst_ros.dynamics.traced_dynamics import (
+    LEGS,
+    MOTION,
+    STATE_SIZE,
+    TORQUE_SYMBOLS,
+    Dynamics,
+    parameter_symbols,
+)
 from sst_ros.errors import SingularConfiguration, refusal
 from sst_ros.mechanism.generic_math import (
     Triple,
@@ -44,9 +51,11 @@ from sst_ros.mechanism.geometry import Geometry
 from sst_ros.programs.compiled import compile_functions
 from sst_ros.programs.expression import (
     compile_for_arrays,
+    divide,
     mark_present,
     trace,
 )
+from sst_ros.scene.loads import NANOSECOND
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Section, build_unchecked, key_of, leaves
 from sst_ros.scene.torque_profile import (
@@ -58,13 +67,13 @@ from sst_ros.scene.torque_profile import (
     TorqueTable,
 )
 from sst_ros.scene.yaml_document import find_fields, find_number, plain, replace_values
-from sst_ros.state import Array, clamp, freeze
+from sst_ros.state import QUATERNION, STAR, STAR_RATE, Array, clamp, freeze
 
 SENSITIVITY_TOLERANCE = 1e-12
 """Error of a step, relative and absolute; the latter over the size of a parameter."""
 
 AT_STOPS = 0.1
-"""Share of it where stops are elastic.
+"""Share of SENSITIVITY_TOLERANCE that is allowed where stops are elastic.
 
 A step across a jump of derivatives loses order.
 """
@@ -111,8 +120,11 @@ class VariationalEquations:
         by_torque: bool = False,
         caller: str = "simulate",
     ) -> None:
-        self.scene, self.names = scene, tuple(names)
-        self._torque, self._geometry, self._caller = torque, Geometry.of(scene), caller
+        self.scene = scene
+        self.names = tuple(names)
+        self._torque = torque
+        self._geometry = Geometry.of(scene)
+        self._caller = caller
         self._by_torque = by_torque
         refuse_other_numbers(scene, self.names, caller)
 
@@ -123,16 +135,13 @@ class VariationalEquations:
         from 0 on, of shape (n, m), and their derivatives, (n, m, p), with those by the
         numbers of the torques last; raises InputError where there is no motion.
         """
-        # Inertias between iterations of a fit need not be those of bodies that can
-        # exist.
-        outer = zip(self.names, values.tolist(), strict=True)
-        scene = self.scene.with_values(
-            {
-                name: value
-                for name, value in outer
-                if name.startswith(("initial", "stroke"))
-            }
-        )
+        # Only start and stroke are checked as a scene's: inertias between iterations of
+        # a fit need not be those of bodies that can exist.
+        checked_values = {}
+        for name, value in zip(self.names, values.tolist(), strict=True):
+            if name.startswith(("initial", "stroke")):
+                checked_values[name] = value
+        scene = self.scene.with_values(checked_values)
         state, slopes = self._start(scene)
         solution = self.integrate(state, slopes, t, values, scene=scene)
         if solution is None:
@@ -154,9 +163,9 @@ class VariationalEquations:
         """Integrate from a state, (m,), and its derivatives, (m, k), to times t [s].
 
         The last of the k numbers are the parameters, with these values, and those of
-        the torques; of others the motion depends by its state alone. Returns as `run`,
-        None where there is no motion, or where it needs more evaluations than
-        MOST_MOTION_EVALUATIONS.
+        the torques; the numbers before them change the motion by its initial state
+        alone. Returns what `run` does, or None where there is no motion, or where it
+        needs more evaluations than MOST_MOTION_EVALUATIONS.
         """
         from scipy.integrate import solve_ivp  # takes 0.3 s, which few runs need
 
@@ -164,15 +173,58 @@ class VariationalEquations:
             scene = self.scene
         if values is None:
             values = np.empty(0)
-        parameters, factor = self._parameters(scene, values)
         numbers = np.append(values, _numbers(self._torque) if self._by_torque else [])
         size = len(state)
-        y = np.concatenate([state, slopes.ravel()])
         first = slopes.shape[1] - len(numbers)  # column of the first parameter
+        rates = self._rates(scene, size, first, values)
+        tolerance = SENSITIVITY_TOLERANCE
+        if scene.stroke.at_end == "elastic":
+            tolerance = SENSITIVITY_TOLERANCE * AT_STOPS
+        parameter_sizes = np.append(np.ones(first), np.abs(numbers))
+        parameter_sizes = parameter_sizes + (parameter_sizes == 0.0)
+        absolute = np.append(np.ones(size), np.tile(1.0 / parameter_sizes, size))
+        limit = scene.torque_limit
+        end = max(float(t[-1]), NANOSECOND)  # SciPy needs an interval
+        breaks = self._torque.kinks(limit, end)
+        inside = breaks[(breaks > 0.0) & (breaks < end)]
+        y = np.concatenate([state, slopes.ravel()])
+        rows = np.empty((len(t), len(y)))
+        rows[t <= 0.0] = y
+        begin = 0.0
+        for stop in np.append(np.unique(inside), end).tolist():
+            reached = (t > begin) & (t <= stop)
+            piece = self._torque.piece(begin, stop)
+            forcing = self._forcing(begin, stop, limit)
+            try:
+                run = solve_ivp(
+                    rates, (begin, stop), y, "DOP853", np.union1d(t[reached], stop),
+                    rtol=tolerance, atol=tolerance * absolute, args=(piece, forcing),
+                )  # fmt: skip
+            except (ArithmeticError, ValueError):
+                return None
+            if run.status != 0:
+                return None
+            rows[reached] = run.y.T[: int(reached.sum())]
+            y = run.y[:, -1]
+            begin = stop
+        return rows[:, :size], rows[:, size:].reshape(len(t), size, -1)
+
+    def _rates(
+        self, scene: Scene, size: int, first: int, values: Array
+    ) -> Callable[[float, Array, TorqueProfile, Callable[[float], Array]], Array]:
+        """Return the variational equations as a function for `solve_ivp`.
+
+        It takes the time [s]; a state of `size` numbers, then its derivatives, of which
+        those by the parameters with these values begin in the column `first`; the
+        torques, and their derivatives by their numbers, both over time. It raises
+        ArithmeticError after MOST_MOTION_EVALUATIONS calls.
+        """
+        parameters, factor = self._parameters(scene, values)
         limit = scene.torque_limit
         evaluations = iter(range(MOST_MOTION_EVALUATIONS))
         derivatives = trace_derivatives(self.scene, self.names, self._by_torque)
-        blocks = np.cumsum([1, size, 3 * self._by_torque])
+        # rows of y', by the state, by the torques and by the parameters
+        blocks = np.cumsum([1, size, LEGS * self._by_torque])
 
         def rates(
             time: float,
@@ -191,34 +243,7 @@ class VariationalEquations:
             flow[:, first:] += np.hstack(own)
             return np.concatenate([rate[0], flow.ravel()])
 
-        tolerance = SENSITIVITY_TOLERANCE
-        if scene.stroke.at_end == "elastic":
-            tolerance = SENSITIVITY_TOLERANCE * AT_STOPS
-        sizes = np.append(np.ones(first), np.abs(numbers))
-        sizes = sizes + (sizes == 0.0)
-        least = np.append(np.ones(size), np.tile(1.0 / sizes, size))
-        end = max(float(t[-1]), 1e-9)
-        breaks = self._torque.kinks(limit, end)
-        inside = breaks[(breaks > 0.0) & (breaks < end)]
-        rows = np.empty((len(t), len(y)))
-        rows[t <= 0.0] = y
-        begin = 0.0
-        for stop in np.append(np.unique(inside), end).tolist():
-            reached = (t > begin) & (t <= stop)
-            law = self._torque.piece(begin, stop), self._forcing(begin, stop, limit)
-            try:
-                run = solve_ivp(
-                    rates, (begin, stop), y, "DOP853", np.union1d(t[reached], stop),
-                    rtol=tolerance, atol=tolerance * least, args=law,
-                )  # fmt: skip
-            except (ArithmeticError, ValueError):
-                return None
-            if run.status != 0:
-                return None
-            rows[reached] = run.y.T[: int(reached.sum())]
-            y = run.y[:, -1]
-            begin = stop
-        return rows[:, :size], rows[:, size:].reshape(len(t), size, -1)
+        return rates
 
     def _parameters(self, scene: Scene, values: Array) -> tuple[list[float], Array]:
         """Return the parameters as the equations take them, and factors of derivatives.
@@ -228,12 +253,13 @@ class VariationalEquations:
         parameters = values.tolist()
         factor = np.ones(len(values))
         rebound = [i for i, name in enumerate(self.names) if name in REBOUND]
-        if rebound:
-            slopes = dict(zip(REBOUND, differentiate_damping(scene), strict=True))
-            for i in rebound:
-                factor[i] = slopes[self.names[i]]
-                parameters[i] = 0.0
-            parameters[rebound[0]] = damping_of(scene.stroke)
+        if not rebound:
+            return parameters, factor
+        slopes = dict(zip(REBOUND, differentiate_damping(scene), strict=True))
+        for i in rebound:
+            factor[i] = slopes[self.names[i]]
+            parameters[i] = 0.0
+        parameters[rebound[0]] = damping_of(scene.stroke)
         return parameters, factor
 
     def differentiate_joints(self, motion: Array) -> Array:
@@ -246,74 +272,89 @@ class VariationalEquations:
     def differentiate_joints_by_geometry(self, motion: Array) -> Array:
         """Differentiate gamma and gamma_dot at a fixed state by the parameters.
 
-        The state has the shape (7, n), the derivatives (p, 6, n); by what is no number
-        of the geometry they are zero.
+        The state has the shape (7, n), the derivatives (p, 6, n). Those by numbers that
+        are not of the geometry are zero.
         """
         names = tuple(name for name in self.names if name.startswith(GEOMETRY))
         slopes = np.zeros((len(self.names), 6, motion.shape[1]))
         chosen = [self.names.index(name) for name in names]
-        slopes[chosen] = self._joint_slopes(motion, names)[7:]
+        slopes[chosen] = self._joint_slopes(motion, names)[STATE_SIZE:]
         return slopes
 
     def _joint_slopes(self, motion: Array, names: tuple[str, ...]) -> Array:
-        """Differentiate gamma and gamma_dot by quaternion, W and geometry numbers."""
+        """Differentiate gamma and gamma_dot by quaternion, W and geometry numbers.
+
+        `motion` has the shape (7, n), the derivatives (7 + names, 6, n).
+        """
+        count = motion.shape[1]
         numbers = [find_number(self.scene, name) for name in names]
         columns = _trace_joints(self.scene, names)(*motion, *numbers)
-        rows = np.stack([np.broadcast_to(row, motion.shape[1]) for row in columns])
-        return rows.reshape(-1, 6, motion.shape[1])[1:]
+        rows = np.stack([np.broadcast_to(row, count) for row in columns])
+        _values, *slopes = rows.reshape(-1, 2 * LEGS, count)
+        return np.array(slopes)
 
     def _start(self, scene: Scene) -> tuple[Array, Array]:
         """Return the initial state, and derivatives by parameters and torques."""
         torque_count = len(_numbers(self._torque)) if self._by_torque else 0
         state = np.zeros(len(Dynamics.of(scene).state))
-        state[:7] = initial_state(scene, self._geometry)
+        state[STAR] = initial_state(scene, self._geometry)
         slopes = np.zeros((len(state), len(self.names) + torque_count))
         own = [i for i, name in enumerate(self.names) if name.startswith("initial")]
         shaped = [i for i, name in enumerate(self.names) if name.startswith(GEOMETRY)]
-        if own or shaped:
-            # A rotation vector and W in {E} change gamma and gamma_dot: the inverse of
-            # that.
-            tangent = np.zeros((7, 6))
-            tangent[4:, 3:] = np.eye(3)
-            for i, axis in enumerate(np.eye(3)):
-                tangent[:4, i] = quaternion_rate(tuple(state[:4]), tuple(axis))
-            forward = self.differentiate_joints(state[:7, None])[..., 0].T @ tangent
-            try:
-                by_joints = tangent @ np.linalg.inv(forward)
-            except np.linalg.LinAlgError:
-                message = (
-                    "no derivative by initial angles or rates: parallel"
-                    " singularity, det"
-                )
-                raise SingularConfiguration(message, 0.0) from None
+        if not own and not shaped:
+            return state, slopes
+        by_joints = self._start_by_joints(state[STAR])
         if shaped:  # the star moves so that gamma and gamma_dot stay
-            by_geometry = self.differentiate_joints_by_geometry(state[:7, None])[
-                shaped, :, 0
-            ]
-            slopes[:7, shaped] = -by_joints @ by_geometry.T
+            start = state[STAR, None]
+            by_geometry = self.differentiate_joints_by_geometry(start)[shaped, :, 0]
+            slopes[STAR, shaped] = -by_joints @ by_geometry.T
         for i in own:
             name = self.names[i]
-            first = 3 if name.startswith("initial.gamma_dot") else 0
-            rows = [first, first + 1, first + 2]
+            first = LEGS if name.startswith("initial.gamma_dot") else 0
+            legs = list(range(LEGS))
             if name.endswith("]"):
-                rows = [first + int(name[-2])]
-            slopes[:7, i] = by_joints[:, rows].sum(axis=1)
+                legs = [int(name[-2])]  # a single digit stands before the bracket
+            columns = [first + leg for leg in legs]
+            slopes[STAR, i] = by_joints[:, columns].sum(axis=1)
         return state, slopes
+
+    def _start_by_joints(self, start: Array) -> Array:
+        """Differentiate quaternion and W, (7,), by gamma and gamma_dot, (7, 6).
+
+        It is the inverse of how gamma and gamma_dot change by a rotation vector and W,
+        both in {E}. SingularConfiguration is raised where there is none.
+        """
+        tangent = np.zeros((STATE_SIZE, 6))
+        tangent[STAR_RATE, LEGS:] = np.eye(3)
+        for i, axis in enumerate(np.eye(3)):
+            tangent[QUATERNION, i] = quaternion_rate(
+                tuple(start[QUATERNION]), tuple(axis)
+            )
+        forward = self.differentiate_joints(start[:, None])[..., 0].T @ tangent
+        try:
+            return np.asarray(tangent @ np.linalg.inv(forward))
+        except np.linalg.LinAlgError:
+            message = (
+                "no derivative by initial angles or rates: parallel singularity, det"
+            )
+            raise SingularConfiguration(message, 0.0) from None
 
     def _forcing(
         self, begin: float, end: float, limit: float | None
     ) -> Callable[[float], Array]:
-        """Return the torques' derivatives by their numbers.
+        """Return the torques' derivatives by their numbers over time.
 
-        They are returned as a function for the times between two kinks.
+        The function is for times between two kinks, at which torques beyond the limit
+        do not change.
         """
         if not self._by_torque:
             return lambda time: np.empty((0, 0))
         slopes = _differentiate_torque(self._torque, begin, end)
         middle = 0.5 * (begin + end)
         acting = np.abs(self._torque.piece(begin, end).at(middle))
-        free = (acting <= (np.inf if limit is None else limit))[:, None]
-        return lambda time: slopes(time) * free
+        largest = np.inf if limit is None else limit
+        is_free = (acting <= largest)[:, None]
+        return lambda time: slopes(time) * is_free
 
 
 def refuse_other_numbers(scene: Scene, names: Sequence[str], caller: str) -> None:
@@ -348,23 +389,20 @@ class _TracedAxes(NamedTuple):
 
     @classmethod
     def of(cls, scene: Any) -> _TracedAxes:
-        """Derive them as `Geometry.build`.
-
-        Base and star of the scene may have symbols.
-        """
-        v = [_unit(triple(row)) for row in scene.base.v]
-        w, arcs = [], []
-        for k in range(3):
-            begin, end = v[k], v[(k + 1) % 3]
+        """Derive them as `Geometry.build` does, of base and star with symbols."""
+        v_1, v_2, v_3 = (_unit(triple(row)) for row in scene.base.v)
+        w = []
+        arcs = []
+        for begin, end in ((v_1, v_2), (v_2, v_3), (v_3, v_1)):
             normal = cross3(begin, end)
             sine = sqrt(dot3(normal, normal))
             w.append(triple(x / sine for x in normal))
             arcs.append(atan2(sine, dot3(begin, end)))
         degree = float(np.radians(1.0))
         alpha_12, alpha_23, _ = (degree * angle for angle in scene.star.alpha_deg)
-        turns = 0.0, alpha_12, alpha_12 + alpha_23
+        turns = (0.0, alpha_12, alpha_12 + alpha_23)
         e = [(-sin(turn), cos(turn), 0.0) for turn in turns]
-        return cls(v, w, e, arcs)
+        return cls([v_1, v_2, v_3], w, e, arcs)
 
     def of_leg(self, name: str, k: int) -> Any:
         """Return what an array has for leg k."""
@@ -379,8 +417,9 @@ def _unit(vector: Triple) -> Triple:
 def _open_model(scene: Scene, symbols: dict[str, Any]) -> Any:
     """Return the model of a scene with symbols for some of its numbers."""
     opened = build_unchecked(Scene, replace_values(plain(scene), symbols))
-    varied = any(name.startswith(GEOMETRY) for name in symbols)
-    geometry: Any = _TracedAxes.of(opened) if varied else Geometry.of(scene)
+    geometry: Any = Geometry.of(scene)
+    if any(name.startswith(GEOMETRY) for name in symbols):
+        geometry = _TracedAxes.of(opened)
     return kernel.model_of(opened, geometry)
 
 
@@ -390,16 +429,18 @@ def trace_derivatives(
 ) -> Callable[..., list[float]]:
     """Return y', then its derivatives by y, by torques if needed, and by parameters."""
     state = Dynamics.of(scene).state
-    size, varied = len(state), tuple(f"p{i}" for i in range(len(names)))
+    varied = parameter_symbols(len(names))
+    sizes = {"state": len(state), "torque": LEGS, "parameters": len(names)}
 
     def derivative(*inputs: Any) -> tuple[Any, ...]:
-        symbols = dict(zip(names, map(mark_present, inputs[size + 3 :]), strict=True))
+        of = divide(sizes, inputs)
+        symbols = dict(zip(names, map(mark_present, of["parameters"]), strict=True))
         rebound = [symbols.pop(name) for name in names if name in REBOUND]
         if rebound:  # their numbers add up to the damping
             damping = mark_present(sum(rebound[1:], rebound[0]))
             symbols |= {"stroke.damping": damping, **dict.fromkeys(REBOUND)}
         model = _open_model(scene, symbols)
-        return kernel.derivative(model, inputs[:size], inputs[size : size + 3])
+        return kernel.derivative(model, of["state"], of["torque"])
 
     by = (*state, *(TORQUE_SYMBOLS if by_torque else ()), *varied)
     program = trace(derivative, (*state, *TORQUE_SYMBOLS, *varied), by)
@@ -411,12 +452,13 @@ def _trace_joints(
     scene: Scene, names: tuple[str, ...]
 ) -> Callable[..., tuple[Any, ...]]:
     """Return gamma, gamma_dot and derivatives by quaternion, W and named numbers."""
-    inputs = (*MOTION, *(f"p{i}" for i in range(len(names))))
+    inputs = (*MOTION, *parameter_symbols(len(names)))
 
     def angles_and_rates(*values: Any) -> tuple[Any, ...]:
-        symbols = dict(zip(names, map(mark_present, values[7:]), strict=True))
+        motion, numbers = values[:STATE_SIZE], values[STATE_SIZE:]
+        symbols = dict(zip(names, map(mark_present, numbers), strict=True))
         model = _open_model(scene, symbols) if names else Dynamics.of(scene).model
-        joints = kernel.joints(model, values[:7])
+        joints = kernel.joints(model, motion)
         return (*joints.gamma, *joints.gamma_dot)
 
     return compile_for_arrays(trace(angles_and_rates, inputs, inputs))
@@ -428,9 +470,9 @@ def _numbers(torque: TorqueProfile) -> Array:
         return np.array([*torque.amplitude, *torque.frequency, *torque.phase])
     if isinstance(torque, PolynomialTorque):
         return torque.c.ravel()
-    return np.ravel(
-        torque.torques if isinstance(torque, TorqueTable) else torque.values(FIRST_TIME)
-    )
+    if isinstance(torque, TorqueTable):
+        return np.ravel(torque.torques)
+    return np.ravel(torque.values(FIRST_TIME))
 
 
 def _differentiate_torque(
@@ -439,13 +481,14 @@ def _differentiate_torque(
     """Return derivatives of torques by `_numbers`, (3, q), between kinks [s]."""
     unit = np.eye(3)
     if isinstance(torque, SineTorque):
-        size, f, phase = map(
-            np.array, (torque.amplitude, torque.frequency, torque.phase)
-        )
+        amplitude = np.array(torque.amplitude)
+        frequency = np.array(torque.frequency)
+        phase = np.array(torque.phase)
 
         def sine(time: float) -> Array:
-            turn = unit * size * np.cos(f * time + phase)
-            return np.hstack([unit * np.sin(f * time + phase), turn * time, turn])
+            angle = frequency * time + phase
+            by_phase = unit * amplitude * np.cos(angle)
+            return np.hstack([unit * np.sin(angle), by_phase * time, by_phase])
 
         return sine
     if isinstance(torque, TorqueTable):
@@ -468,11 +511,10 @@ def _differentiate_torque(
 
 
 def differentiate_damping(scene: Scene) -> tuple[float, float]:
-    """Return derivatives of the damping by restitution and impact rate.
+    """Differentiate the damping by restitution [s/rad] and impact rate [s^2/rad^2].
 
-    Their units are s/rad and s^2/rad^2. By d (1 + e) = ln((1 + d) / (1 - d e)), see
-    `damping_of`, with s = d (1 + e): ds/de = d / (1 - e - e d), which is -3 where e =
-    1. The damping is d / v.
+    The damping is d / v, and s = d (1 + e) = ln((1 + d) / (1 - d e)), see `damping_of`.
+    So ds/de = d / (1 - e - e d), which is -3 where e = 1.
     """
     e, v = scene.stroke.restitution, scene.stroke.impact_rate
     assert e is not None and v is not None
@@ -507,27 +549,23 @@ class Sensitivities:
     A vector means each of its components, a list each of its entries, in their order,
     and "torque" the numbers of the profile: the three torques, `torques` of a
     `TorqueTable`, coefficients of a `PolynomialTorque`, or amplitudes, frequencies and
-    phases of a `SineTorque`. InputError: one is no such number, or the torques are a
-    function of the state.
+    phases of a `SineTorque`. InputError is raised where one is no such number, or the
+    torques are a function of the state.
     """
 
     def __init__(
         self, scene: Scene, names: Iterable[str], torque: TorqueProfile
     ) -> None:
-        keys = {
-            name: [] if name == OWN_TORQUE else list_numbers(scene, name)
-            for name in names
-        }
+        keys: dict[str, list[str]] = {}
+        for name in names:
+            keys[name] = [] if name == OWN_TORQUE else list_numbers(scene, name)
         flat = list(dict.fromkeys(chain(*keys.values())))
-        self._columns: dict[str, Any] = {
-            name: (
-                slice(len(flat), None)
-                if name == OWN_TORQUE
-                else [flat.index(key) for key in own]
-            )
-            for name, own in keys.items()
-        }
+        self._columns: dict[str, Any] = {}
+        for name, own in keys.items():
+            self._columns[name] = [flat.index(key) for key in own]
         by_torque = OWN_TORQUE in keys
+        if by_torque:  # behind all numbers of the scene
+            self._columns[OWN_TORQUE] = slice(len(flat), None)
         requirement = ""
         if torque.feedback or isinstance(torque, LostTorque):
             requirement = (
@@ -544,31 +582,34 @@ class Sensitivities:
 
     def at(self, t: Array) -> dict[str, Sensitivity]:
         """Return sensitivities by parameter name at ascending times [s] >= 0, (n,)."""
-        states, slopes = self._equations.run(self._values, t)
-        motion, slopes = states[:, :7].T, slopes[:, :7]
-        turn = np.array(
-            [quaternion_rate(tuple(motion[:4]), tuple(row)) for row in np.eye(3)]
-        )
+        states, state_slopes = self._equations.run(self._values, t)
+        motion = states[:, STAR].T
+        slopes = state_slopes[:, STAR]
+        q = tuple(motion[QUATERNION])
+        turn = np.array([quaternion_rate(q, tuple(axis)) for axis in np.eye(3)])
         rates = np.einsum(
             "qcn,nqp->ncp", self._equations.differentiate_joints(motion), slopes
         )
         by_geometry = self._equations.differentiate_joints_by_geometry(motion)
         rates[..., : len(by_geometry)] += np.moveaxis(by_geometry, (0, 2), (2, 0))
         # quaternion_rate(q, .) has orthogonal columns of length abs(q) / 2.
-        rotation = 4.0 * np.einsum("cqn,nqp->ncp", turn, slopes[:, :4])
-        by_all_parameters = Sensitivity(
-            rates[:, :3], rates[:, 3:], rotation, slopes[:, 4:]
+        by_quaternion = slopes[:, QUATERNION]
+        rotation = 4.0 * np.einsum("cqn,nqp->ncp", turn, by_quaternion)
+        by_all_numbers = Sensitivity(
+            gamma=rates[:, :LEGS],
+            gamma_dot=rates[:, LEGS:],
+            rotation=rotation,
+            body_rate=slopes[:, STAR_RATE],
         )
-        return {
-            name: Sensitivity(
-                *(freeze(array[..., columns]) for array in by_all_parameters)
-            )
-            for name, columns in self._columns.items()
-        }
+        sensitivities = {}
+        for name, columns in self._columns.items():
+            arrays = [freeze(array[..., columns]) for array in by_all_numbers]
+            sensitivities[name] = Sensitivity(*arrays)
+        return sensitivities
 
 
 def list_numbers(scene: Scene, name: str) -> list[str]:
-    """Return the key of each number that a key names; itself where it names nothing.
+    """Return the key of each number that a key names, or the key where it names none.
 
     A section means all of its numbers, as "star.inertia" its six.
     """
@@ -578,7 +619,9 @@ def list_numbers(scene: Scene, name: str) -> list[str]:
         return [name]
     keys = []
     for place, value, _ in fields:
-        section = isinstance(value, Section)
-        below = leaves(value) if section else np.ndindex(np.shape(value))
-        keys += [key_of((*place, *inner_place)) for inner_place in below]
+        if isinstance(value, Section):
+            inner_places = list(leaves(value))
+        else:
+            inner_places = list(np.ndindex(np.shape(value)))
+        keys += [key_of((*place, *inner_place)) for inner_place in inner_places]
     return keys

@@ -38,37 +38,49 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from sst_ros.identification.parameters import STANDARD
+from sst_ros.identification.parameters import (
+    FIRST_MOMENTS,
+    INERTIA_ENTRIES,
+    STANDARD,
+)
 from sst_ros.mechanism.geometry import Array
 
 # noise over RMS terms that is assumed at least: simulations have no other
 LEAST_NOISE = 1e-12
 VARIANCE_STEPS = 2  # fits by which the noise is estimated: unweighted, and weighted
-# of the variance from rest to the highest frequency, looked through: none, and from
-# what is too small to see to noise of angles alone
+# Growths of the variance from rest to the highest frequency that are tried: none, and
+# from what is too small to see to noise of angles alone.
 GROWTHS = np.append(0.0, np.geomspace(0.05, 500.0, 41))
 SMALLEST_VARIANCE = 1e-300  # of residuals that are zero
 INTERIOR = 1e-3  # share of its size by which a parameter is lifted at the start
-BARRIERS = tuple(
-    10.0**-k for k in range(0, 11)
-)  # the last: chi^2 off by 1e-10 at each boundary
+# Factors of the barrier, each a tenth of the one before; by the last chi^2 is off by
+# 1e-10 at each boundary.
+BARRIERS = tuple(10.0**-k for k in range(0, 11))
 # squared decrement over the barrier below which Newton converges quadratically
 CENTRED = 1e-2
-_BARRIER_NEWTON_STEPS = 100
+_BARRIER_NEWTON_STEPS = 100  # at most, with each barrier
 SMALLEST_STEP = 1e-12  # share of a step below which it is rounding
 LARGEST_DOUBLE = float(np.finfo(float).max)
-_CLOSE = 0.95  # share of the distance to the boundary that a step may cover
+_BOUNDARY_SHARE = 0.95  # of the distance to the boundary that a step may cover
 
-_PSEUDO = np.zeros((10, 4, 4))  # J of each of the ten parameters alone
-_PSEUDO[0, 3, 3] = 1.0
-for _i in range(3):
-    _PSEUDO[1 + _i, [_i, 3], [3, _i]] = 1.0
-for _row, (_i, _j) in enumerate(
-    ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)), start=4
-):
-    _PSEUDO[_row, [_i, _j], [_j, _i]] = -1.0
-    if _i == _j:
-        _PSEUDO[_row, :3, :3] += 0.5 * np.eye(3)
+
+def _unit_pseudo_inertias() -> dict[str, Array]:
+    """Return J of each of the parameters of STANDARD alone, shape (4, 4)."""
+    units = {name: np.zeros((4, 4)) for name in STANDARD}
+    units["mass"][-1, -1] = 1.0
+    for axis, name in enumerate(FIRST_MOMENTS):
+        units[name][axis, -1] = 1.0
+        units[name][-1, axis] = 1.0
+    for name in INERTIA_ENTRIES:
+        row, column = map("xyz".index, name.removeprefix("inertia."))
+        units[name][row, column] = -1.0
+        units[name][column, row] = -1.0
+        if row == column:
+            units[name][:-1, :-1] += 0.5 * np.eye(3)  # of tr(I) / 2
+    return units
+
+
+_UNIT_PSEUDO_INERTIAS = _unit_pseudo_inertias()
 
 
 class LinearFit(NamedTuple):
@@ -211,68 +223,106 @@ def find_consistent_values(
     Returns the values, shape (p,), and chi^2 of the base parameters there: how much
     worse the torques are fitted than without the constraints.
     """
-    sizes, (constant, basis) = scales(names, start), make_cones(names, reach)
-    rows = np.vstack([root @ transform, np.diag(1.0 / sizes)])
-    right = np.concatenate([root @ estimate, start / sizes])
-    identity = np.tile(np.eye(4), (len(constant), 1, 1)).ravel()
+    sizes = scales(names, start)
+    constant, basis = make_cones(names, reach)
+    problem = _BarrierProblem(
+        rows=np.vstack([root @ transform, np.diag(1.0 / sizes)]),
+        right=np.concatenate([root @ estimate, start / sizes]),
+        constant=constant,
+        basis=basis,
+    )
+    # Into the interior: flat bodies and what is zero lie on the boundary.
+    is_lifted = [
+        ".moment." not in name and not name.endswith(("xy", "xz", "yz"))
+        for name in names
+    ]
+    values = start + INTERIOR * sizes * is_lifted
+    for barrier in BARRIERS:
+        values = problem.minimize(values, barrier)
+    off = root @ (transform @ values - estimate)
+    return values, float(off @ off)
 
-    def cost(values: Array, barrier: float) -> float:
-        """|rows values - right|^2 / 2 - barrier sum log det.
 
-        Infinite outside the cones.
+class _BarrierProblem(NamedTuple):
+    """|rows values - right|^2 / 2 under constraints, by a logarithmic barrier.
+
+    The constraints: matrices that are linear in the values are positive definite.
+    """
+
+    rows: Array  # shape (m, p)
+    right: Array  # shape (m,)
+    constant: Array  # of k matrices, shape (k, 4, 4)
+    basis: Array  # what a unit of each value adds to them, shape (p, k, 4, 4)
+
+    def minimize(self, values: Array, barrier: float) -> Array:
+        """Take Newton's steps from values inside the constraints to the minimum.
+
+        Where the decrement says that Newton converges quadratically, one more step is
+        taken, whatever the cost is to rounding.
+        """
+        for _ in range(_BARRIER_NEWTON_STEPS):
+            newton = self._newton_step(values, barrier)
+            centred = newton.decrement < CENTRED * barrier
+            most = LARGEST_DOUBLE if centred else self._cost(values, barrier)
+            share = self._shorten(values, newton, barrier, most)
+            values = values + share * newton.step
+            if centred or share == 0.0:
+                break
+        return values
+
+    def _matrices(self, values: Array) -> Array:
+        return np.asarray(self.constant + np.tensordot(values, self.basis, 1))
+
+    def _cost(self, values: Array, barrier: float) -> float:
+        """Return |rows values - right|^2 / 2 - barrier sum log det.
+
+        It is infinite where a matrix is not positive definite.
         """
         try:
-            factors = np.linalg.cholesky(constant + np.tensordot(values, basis, 1))
+            factors = np.linalg.cholesky(self._matrices(values))
         except np.linalg.LinAlgError:
             return np.inf
-        off = rows @ values - right
+        off = self.rows @ values - self.right
         logs = np.log(np.diagonal(factors, axis1=1, axis2=2))
         return float(0.5 * off @ off - 2.0 * barrier * logs.sum())
 
-    def shorten(
-        values: Array, step: Array, size: float, barrier: float, most: float
+    def _newton_step(self, values: Array, barrier: float) -> _NewtonStep:
+        """Return Newton's step, which solves a linear least-squares problem."""
+        factors = np.linalg.cholesky(self._matrices(values))
+        inverse = np.linalg.inv(factors)
+        # Of the matrices by the values, in units of the matrices themselves.
+        slopes = inverse @ self.basis @ inverse.transpose(0, 2, 1)
+        barrier_rows = np.sqrt(barrier) * slopes.reshape(len(values), -1).T
+        identity = np.tile(np.eye(4), (len(self.constant), 1, 1)).ravel()
+        matrix = np.vstack([self.rows, barrier_rows])
+        target = np.concatenate(
+            [self.right - self.rows @ values, np.sqrt(barrier) * identity]
+        )
+        lengths = np.linalg.norm(matrix, axis=0)
+        q, r = np.linalg.qr(matrix / lengths)
+        rotated = q.T @ target
+        step = solve_triangular(r, rotated) / lengths
+        changes = np.linalg.eigvalsh(np.tensordot(step, slopes, 1))
+        least = float(changes.min(initial=0.0))  # -1 at the boundary
+        largest = 1.0 if least > -_BOUNDARY_SHARE else -_BOUNDARY_SHARE / least
+        return _NewtonStep(step, float(rotated @ rotated), largest)
+
+    def _shorten(
+        self, values: Array, newton: _NewtonStep, barrier: float, most: float
     ) -> float:
         """Halve a step until the cost is no more than `most`; 0 where it stays more."""
-        while size > SMALLEST_STEP:
-            if cost(values + size * step, barrier) <= most:
-                return size
-            size *= 0.5
+        share = newton.largest
+        while share > SMALLEST_STEP:
+            if self._cost(values + share * newton.step, barrier) <= most:
+                return share
+            share *= 0.5
         return 0.0
 
-    # Into the interior: flat bodies and what is zero lie on the boundary.
-    lifted = [
-        ".moment." not in name and name[-2:] not in ("xy", "xz", "yz") for name in names
-    ]
-    values = start + INTERIOR * sizes * lifted
-    for barrier in BARRIERS:
-        for _ in range(_BARRIER_NEWTON_STEPS):
-            inverse = np.linalg.inv(
-                np.linalg.cholesky(constant + np.tensordot(values, basis, 1))
-            )
-            # Of the matrices by the parameters, in units of themselves.
-            slopes = inverse @ basis @ inverse.transpose(0, 2, 1)
-            matrix = np.vstack(
-                [rows, np.sqrt(barrier) * slopes.reshape(len(values), -1).T]
-            )
-            target = np.concatenate(
-                [right - rows @ values, np.sqrt(barrier) * identity]
-            )
-            lengths = np.linalg.norm(matrix, axis=0)
-            q, r = np.linalg.qr(matrix / lengths)
-            rotated = q.T @ target
-            step = solve_triangular(r, rotated) / lengths
-            least = float(
-                np.linalg.eigvalsh(np.tensordot(step, slopes, 1)).min(initial=0.0)
-            )
-            size = 1.0 if least > -_CLOSE else -_CLOSE / least
-            centred = rotated @ rotated < CENTRED * barrier
-            most = LARGEST_DOUBLE if centred else cost(values, barrier)
-            size = shorten(values, step, size, barrier, most)
-            values = values + size * step
-            if centred or size == 0.0:
-                break
-    off = root @ (transform @ values - estimate)
-    return values, float(off @ off)
+
+class _NewtonStep(NamedTuple):
+    step: Array  # shape (p,)
+    decrement: float  # squared
+    largest: float  # share of the step that stays inside the constraints, 1 at most
 
 
 def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
@@ -282,22 +332,22 @@ def make_cones(names: Sequence[str], reach: float) -> tuple[Array, Array]:
     ones, and what each parameter adds for a unit, shape (p, k, 4, 4).
     """
     cones: list[dict[str, Array]] = []
-    # [[m r 1, h], [h^T, m r]] of m and h.
-    centre = [reach * np.eye(4), *_PSEUDO[1:4]]
     for body in dict.fromkeys(name.partition(".")[0] for name in names):
-        standard_names = [f"{body}.{entry}" for entry in STANDARD]
-        if set(standard_names) <= set(names):
-            cones += (
-                dict(zip(standard_names, _PSEUDO, strict=True)),
-                dict(zip(standard_names, centre, strict=False)),
-            )
-        elif set(standard_names[4:]) <= set(names):
-            cones.append(dict(zip(standard_names[4:], _PSEUDO[4:], strict=True)))
-    cones += [
-        {name: np.diag([1.0, 0.0, 0.0, 0.0])}
-        for name in names
-        if name.startswith(("friction", "springs", "actuators"))
-    ]
+        units = {
+            f"{body}.{entry}": unit for entry, unit in _UNIT_PSEUDO_INERTIAS.items()
+        }
+        inertia = {f"{body}.{entry}" for entry in INERTIA_ENTRIES}
+        if units.keys() <= set(names):
+            cones.append(units)
+            # [[m r 1, h], [h^T, m r]] of m and h.
+            moments = {f"{body}.{entry}" for entry in FIRST_MOMENTS}
+            centre = {name: units[name] for name in moments}
+            cones.append({f"{body}.mass": reach * np.eye(4), **centre})
+        elif inertia <= set(names):
+            cones.append({name: units[name] for name in inertia})
+    for name in names:
+        if name.startswith(("friction", "springs", "actuators")):
+            cones.append({name: np.diag([1.0, 0.0, 0.0, 0.0])})
     basis = np.zeros((len(names), len(cones), 4, 4))
     for k, cone in enumerate(cones):
         for name, matrix in cone.items():
@@ -315,11 +365,10 @@ def scales(names: Sequence[str], start: Array) -> Array:
     sizes = []
     for name in names:
         body, _, entry = name.partition(".")
-        trace = sum(
-            abs(values.get(f"{body}.inertia.{axis}", 0.0))
-            for axis in ("xx", "yy", "zz")
-        )
+        diagonal = (f"{body}.inertia.{axes}" for axes in ("xx", "yy", "zz"))
+        trace = sum(abs(values.get(key, 0.0)) for key in diagonal)
         mass = abs(values.get(f"{body}.mass", 0.0)) or 1.0
         of_body = {"mass": mass, "moment": np.sqrt(mass * trace), "inertia": trace}
-        sizes.append(of_body.get(entry.partition(".")[0], abs(values[name])) or 1.0)
+        quantity = entry.partition(".")[0]
+        sizes.append(of_body.get(quantity, abs(values[name])) or 1.0)
     return np.array(sizes, dtype=float)

@@ -118,16 +118,17 @@ def _refuse_other_rates(motion: MeasuredMotion, rates: Array) -> None:
     steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(motion.t)[:, None]
     travelled = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     # A constant error of a rate is an offset of its sensor: it is let pass.
-    by_rates, by_angles = detrend(travelled, axis=0), detrend(motion.gamma, axis=0)
+    by_rates = detrend(travelled, axis=0)
+    by_angles = detrend(motion.gamma, axis=0)
     for k in range(3):
-        off = np.linalg.norm(by_rates[:, k] - by_angles[:, k])
-        size = max(np.linalg.norm(by_rates[:, k]), np.linalg.norm(by_angles[:, k]))
-        range_by_rates = float(np.ptp(by_rates[:, k]))
-        range_by_angles = float(np.ptp(by_angles[:, k]))
-        if (
-            max(range_by_rates, range_by_angles) > LEAST_TRAVEL
-            and off > RATE_SHARE * size
-        ):
+        integral = by_rates[:, k]
+        angle = by_angles[:, k]
+        off = np.linalg.norm(integral - angle)
+        size = max(np.linalg.norm(integral), np.linalg.norm(angle))
+        range_by_rates = float(np.ptp(integral))
+        range_by_angles = float(np.ptp(angle))
+        moves = max(range_by_rates, range_by_angles) > LEAST_TRAVEL
+        if moves and off > RATE_SHARE * size:
             requirement = (
                 f"must be that of gamma_{k + 1}, {range_by_angles:.3g} rad, and alike: "
                 "rates are in rad/s, times in s"

@@ -19,8 +19,9 @@ actuators.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import null_space
@@ -40,17 +41,23 @@ from sst_ros.identification.parameters import (
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import values_at
+from sst_ros.state import QUATERNION, ZERO
 
-POINTS_A_PERIOD = (
-    12  # samples, and points of the scene, in a period of the highest harmonic
-)
+# samples, and points of the scene, in a period of the highest harmonic
+POINTS_A_PERIOD = 12
 # of each range that the motion may use: the manipulator is not quite its model
 RANGE_SHARE = 0.9
 LEAST_SINE = 0.15  # of mu_k, and det J2: torques and rates grow with their inverse
 _FIRST_AMPLITUDE = 0.05  # amplitude of the first guess [rad]
-_PENALTY = 100.0
-_POINT = ("time", "gamma", "gamma_dot", "gamma_ddot")  # of a quintic between waypoints
+_PENALTY = 100.0  # weight of squared excesses over limits against the logarithms
+_SMALLER = 0.95  # factor by which a motion beyond a limit is made smaller
+_MOST_REDUCTIONS = 40  # then the motion has an eighth of its size
+_SAMPLE_RATE = 1000.0  # [1/s], to which standard deviations refer
 _HOMOTOPY = 8  # steps from the centre to all samples
+_HOMOTOPY_NEWTON_STEPS = 2  # after each of them, which the next one corrects
+_LAST_NEWTON_STEPS = 5  # after the last: to rounding
+_LARGEST_CONDITION = 1e15  # beyond which a condition number is rounding
+_EXCESS_WITHOUT_ASSEMBLY = 1e3  # excess of a motion that no assembly has
 
 
 @dataclass(frozen=True)
@@ -114,27 +121,22 @@ def design(
     )
     names = parameters.select_names(scene, requested)
     trial = _Trial(scene, names, duration, harmonics)
-    free = np.random.default_rng(seed).normal(size=trial.size)
-    free *= _FIRST_AMPLITUDE / np.abs(trial.series(free)[0] - trial.centre).max()
-    found = minimize(
-        trial.cost, free, method="L-BFGS-B", options={"maxiter": iterations}
+    first = np.random.default_rng(seed).normal(size=trial.size)
+    first_gamma, _, _ = trial.series(first)
+    first *= _FIRST_AMPLITUDE / np.abs(first_gamma - trial.centre).max()
+    coefficients = minimize(
+        trial.cost, first, method="L-BFGS-B", options={"maxiter": iterations}
     ).x
-    origin = "designed to identify parameters: Fourier series"
-    changes = {"initial.gamma_dot": 0.0, "torque": None, "provenance.motion": origin}
-    for _ in range(40):
-        rows = zip(trial.times, *trial.series(found), strict=True)
-        points = [dict(zip(_POINT, row, strict=True)) for row in rows]
-        points[-1] |= dict.fromkeys(_POINT[2:], (0.0, 0.0, 0.0))
-        motion = {"motion": {"waypoints": points}, "duration": trial.times[-1]}
-        designed = scene.with_values(changes | motion)
+    for _ in range(_MOST_REDUCTIONS):
+        designed = trial.scene_of(coefficients)
         plan = examine_motion(reference_motion(designed), designed)
-        columns, excess = trial.evaluate(found)
+        columns, excess = trial.evaluate(coefficients)
         if not plan.problems and excess.max() <= 0.0:
-            # Of 1000 samples a second.
-            information = columns.T @ columns * (1000.0 * duration / len(trial.times))
+            samples = _SAMPLE_RATE * duration / len(trial.times)  # for each of these
+            information = columns.T @ columns * samples
             deviation = np.sqrt(np.diag(np.linalg.inv(information)))
             return ExcitingMotion(designed, trial.base, _condition(columns), deviation)
-        found = 0.95 * found
+        coefficients = _SMALLER * coefficients
     room = Problem(
         "initial.gamma", scene.initial.gamma, "leaves no room for a motion about it"
     )
@@ -142,11 +144,11 @@ def design(
 
 
 class _Trial:
-    """Fourier series of free numbers, and how far they determine `base`.
+    """Fourier series of free coefficients, and how far they determine `base`.
 
     The series are about `centre`, at `times`. `base` are the parameters that some
     motion of the scene determines; samples are POINTS_A_PERIOD in a period of the
-    highest harmonic, n of them.
+    highest harmonic, n of them. There are `size` coefficients.
     """
 
     def __init__(
@@ -155,83 +157,136 @@ class _Trial:
         self._regressor = Regressor(scene, names)
         self.base = find_base_parameters(self._regressor)
         requirement = "must determine something: no torque depends on these parameters"
-        found = "parameters", list(names), bool(self.base.chosen), requirement
-        refuse_unless("identify design", found)
-        self._scene, self._values = scene, parameters.values(scene, names)
+        determined = "parameters", list(names), bool(self.base.chosen), requirement
+        refuse_unless("identify design", determined)
+        self._scene = scene
+        self._values = parameters.values(scene, names)
         self._space = ActuatorSpaceMap(Geometry.of(scene))
-        self._start = np.array(initial_state(scene, self._space.geometry)[:4])
+        start = initial_state(scene, self._space.geometry)
+        self._start = np.array(start[QUATERNION])
         self.centre = np.array(scene.initial.gamma)
-        self.times = (
-            np.arange(1, POINTS_A_PERIOD * harmonics + 1)
-            * duration
-            / (POINTS_A_PERIOD * harmonics)
-        )
-        n = np.arange(1, harmonics + 1)
-        # gamma, gamma_dot, gamma_ddot at the beginning
-        at_rest = np.zeros((3, 2 * harmonics))
-        at_rest[0, harmonics:], at_rest[1, :harmonics], at_rest[2, harmonics:] = (
-            1.0,
-            n,
-            n * n,
-        )
-        basis, w = null_space(at_rest), 2.0 * np.pi * n / duration
+        samples = POINTS_A_PERIOD * harmonics
+        self.times = np.arange(1, samples + 1) * duration / samples
+        orders: Array = np.arange(1.0, harmonics + 1.0)
+        frequencies = 2.0 * np.pi * orders / duration  # [rad/s]
+        basis = _rest_basis(orders)
         self.size = 3 * basis.shape[1]
-        s, c = (f(np.outer(self.times, w)) for f in (np.sin, np.cos))
-        derivatives = ([s, c], [c * w, -s * w], [-s * w * w, -c * w * w])
-        self._maps = [np.hstack(harmonics_of) @ basis for harmonics_of in derivatives]
+        phases = np.outer(self.times, frequencies)
+        sine = np.sin(phases)
+        cosine = np.cos(phases)
+        derivatives = (
+            [sine, cosine],
+            [cosine * frequencies, -sine * frequencies],
+            [-sine * frequencies * frequencies, -cosine * frequencies * frequencies],
+        )
+        self._maps = [np.hstack(terms) @ basis for terms in derivatives]
 
-    def series(self, free: Array) -> tuple[Array, Array, Array]:
+    def series(self, coefficients: Array) -> tuple[Array, Array, Array]:
         """Angles [rad] and two derivatives at the samples, each shape (n, 3)."""
-        gamma, rate, acceleration = (part @ free.reshape(-1, 3) for part in self._maps)
+        of_legs = coefficients.reshape(-1, 3)
+        gamma, rate, acceleration = (linear_map @ of_legs for linear_map in self._maps)
         return self.centre + gamma, rate, acceleration
 
-    def cost(self, free: Array) -> float:
+    def scene_of(self, coefficients: Array) -> Scene:
+        """Return the scene with the motion as waypoints; it ends at rest."""
+        points: list[dict[str, Any]] = []
+        series = self.series(coefficients)
+        for time, gamma, rate, acceleration in zip(self.times, *series, strict=True):
+            point = {
+                "time": time,
+                "gamma": gamma,
+                "gamma_dot": rate,
+                "gamma_ddot": acceleration,
+            }
+            points.append(point)
+        points[-1] |= {"gamma_dot": ZERO, "gamma_ddot": ZERO}
+        return self._scene.with_values(
+            {
+                "initial.gamma_dot": 0.0,
+                "torque": None,
+                "provenance.motion": "designed to identify parameters: Fourier series",
+                "motion": {"waypoints": points},
+                "duration": self.times[-1],
+            }
+        )
+
+    def cost(self, coefficients: Array) -> float:
         """Return what the optimisation minimises."""
-        columns, excess = self.evaluate(free)
+        columns, excess = self.evaluate(coefficients)
         information = np.linalg.svd(columns, compute_uv=False) ** 2
         log_deviation = -0.5 * float(np.mean(np.log(np.maximum(information, 1e-300))))
         penalty = _PENALTY * float(np.sum(excess**2))
         return float(np.log(_condition(columns))) + log_deviation + penalty
 
-    def evaluate(self, free: Array) -> tuple[Array, Array]:
+    def evaluate(self, coefficients: Array) -> tuple[Array, Array]:
         """Return the regressor of the base parameters, and excesses over limits.
 
         The regressor of b base parameters has the shape (3 n, b).
         """
-        gamma, rate, acceleration = self.series(free)
-        space, chosen = self._space, self.base.chosen
+        gamma, rate, acceleration = self.series(coefficients)
         with np.errstate(all="ignore"):
-            # From the centre along straight lines, all samples at once.
-            quaternion = np.tile(self._start, (len(gamma), 1))
-            for part in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
-                here = self.centre + part * (gamma - self.centre)
-                quaternion = space.orientations(
-                    quaternion, here, 5 if part == 1.0 else 2
-                )
-            moving = *quaternion.T, *rate.T, *acceleration.T
-            star = np.stack(space.star_accelerations(*moving), axis=1)
-            known, columns = self._regressor(quaternion, star[:, :3], star[:, 3:])
+            quaternion = self._orientations(gamma)
+            motion = *quaternion.T, *rate.T, *acceleration.T
+            star = np.stack(self._space.star_accelerations(*motion), axis=1)
+            body_rate, body_acceleration = np.split(star, 2, axis=1)
+            known, columns = self._regressor(quaternion, body_rate, body_acceleration)
             torque = known + columns @ self._values
-            posture = np.stack(space.postures(*quaternion.T), axis=1)
-        sines, beta, det_j2 = posture[:, :3], posture[:, 3:6], posture[:, 6:]
-        # How far numbers lie beyond RANGE_SHARE of their range, over the range.
-        ranges = (gamma, space.geometry.arc), (beta, space.geometry.beta_max)
-        excess = [
-            np.abs(values / high - 0.5) - 0.5 * RANGE_SHARE for values, high in ranges
-        ]
+            reached = {"torque": torque, "velocity": rate, "acceleration": acceleration}
+            excess = self._find_excess(gamma, quaternion, reached)
+        columns = columns[..., self.base.chosen].reshape(-1, len(self.base.chosen))
+        if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(excess))):
+            return np.ones_like(columns), np.array([_EXCESS_WITHOUT_ASSEMBLY])
+        return columns, np.maximum(excess, 0.0)
+
+    def _orientations(self, gamma: Array) -> Array:
+        """Return quaternions (n, 4) at gamma (n, 3).
+
+        All samples go from the centre along straight lines at once.
+        """
+        quaternion = np.tile(self._start, (len(gamma), 1))
+        for share in np.linspace(0.0, 1.0, _HOMOTOPY + 1)[1:]:
+            angles = self.centre + share * (gamma - self.centre)
+            steps = _LAST_NEWTON_STEPS if share == 1.0 else _HOMOTOPY_NEWTON_STEPS
+            quaternion = self._space.orientations(quaternion, angles, steps)
+        return quaternion
+
+    def _find_excess(
+        self, gamma: Array, quaternion: Array, reached: Mapping[str, Array]
+    ) -> Array:
+        """Return how far numbers lie beyond RANGE_SHARE of their range, over the range.
+
+        `reached` has the quantities that actuators limit, shape (n, 3), by name.
+        """
+        posture = np.stack(self._space.postures(*quaternion.T), axis=1)
+        sines, beta, det_j2 = np.split(posture, (3, 6), axis=1)  # of three legs each
+        geometry = self._space.geometry
+        excess = []
+        for values, high in ((gamma, geometry.arc), (beta, geometry.beta_max)):
+            excess.append(np.abs(values / high - 0.5) - 0.5 * RANGE_SHARE)
         excess.append(LEAST_SINE - np.hstack([sines, np.abs(det_j2)]))
-        reached = {"torque": torque, "velocity": rate, "acceleration": acceleration}
         for name, values in reached.items():
             for limit in values_at(self._scene, f"actuators.{name}_limit"):
                 excess.append(np.abs(values) / limit - RANGE_SHARE)
-        beyond = np.hstack(excess)
-        columns = columns[..., chosen].reshape(-1, len(chosen))
-        if not (np.all(np.isfinite(columns)) and np.all(np.isfinite(beyond))):
-            return np.ones_like(columns), np.array([1e3])
-        return columns, np.maximum(beyond, 0.0)
+        return np.hstack(excess)
+
+
+def _rest_basis(orders: Array) -> Array:
+    """Return the coefficients of series that begin and end at rest in the centre.
+
+    Their columns span all of them: coefficients of the sines, then of the cosines, for
+    which gamma, gamma_dot and gamma_ddot are zero at time 0.
+    """
+    harmonics = len(orders)
+    at_start = np.zeros((3, 2 * harmonics))
+    gamma, gamma_dot, gamma_ddot = at_start  # in units of a base frequency of 1
+    gamma[harmonics:] = 1.0
+    gamma_dot[:harmonics] = orders
+    gamma_ddot[harmonics:] = orders * orders
+    return np.asarray(null_space(at_start))
 
 
 def _condition(columns: Array) -> float:
-    """Condition number with columns of length one, 1e15 at most."""
+    """Condition number with columns of length one, _LARGEST_CONDITION at most."""
     lengths = np.linalg.norm(columns, axis=0)
-    return min(float(np.linalg.cond(columns / np.maximum(lengths, 1e-300))), 1e15)
+    scaled = columns / np.maximum(lengths, 1e-300)
+    return min(float(np.linalg.cond(scaled)), _LARGEST_CONDITION)

@@ -192,15 +192,15 @@ def fit_torques(
     """Identify by torques; arguments as for `identify`."""
     names = parameters.select_names(scene, requested)
     segments = read_segments(data)
-    weights = finite_vector(noise)
+    deviations = finite_vector(noise)
     _check_request(segments, scene, requested, names, noise, delay)
     notes = contradictions.check_angles(segments.motion)
     equations = RegressionEquations(segments.parts, Regressor(scene, names), cutoff)
-    fitted = equations.fit(weights, delay)
+    fitted = equations.fit(deviations, delay)
     other_units = contradictions.check_energy(*equations.compare_energies(fitted))
     values, excess = equations.find_bodies(fitted)
     if excess > INEXPLICABLE and not other_units:
-        equations.refuse_relabelled(fitted, weights, delay)
+        equations.refuse_relabelled(fitted, deviations, delay)
     base = fitted.base
     root = fitted.root
     before = parameters.values(scene, names)
@@ -251,20 +251,16 @@ def _check_request(
         float(np.ptp(segment.gamma, axis=0).max()) for segment in segments.parts
     )
     moves = travel >= STILL or scene.gravity is not None
-    weights = finite_vector(noise)
-    positive = noise is None or (weights is not None and min(weights) > 0.0)
+    deviations = finite_vector(noise)
+    positive = noise is None or (deviations is not None and min(deviations) > 0.0)
     searched = delay is None or abs(delay) <= LONGEST_DELAY
     still = f"moves by less than {STILL:g} rad: a manipulator at rest shows no inertia"
     range_of_delay = f"must be from -{LONGEST_DELAY:g} to {LONGEST_DELAY:g} s"
+    three = "must be three finite standard deviations > 0 [N m]"
     refuse_unless(
         "identify",
         ("gamma", travel, moves, still),
         ("parameters", requested, bool(names), "must name one or more"),
-        (
-            "noise",
-            noise,
-            positive,
-            "must be three finite standard deviations > 0 [N m]",
-        ),
+        ("noise", noise, positive, three),
         ("delay", delay, searched, range_of_delay),
     )

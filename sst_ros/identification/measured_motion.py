@@ -3,8 +3,8 @@
 
 Torques are samples at the times of the angles, or each is held over an interval, as a
 controller's are. Angles of encoders may count whole turns or wrap; stamps may be
-uneven; samples may be missing: over some of them the motion is smooth, at more of them
-it is cut into segments.
+uneven; samples may be missing: where a few are, the motion goes on smoothly; at a
+longer gap it is cut into segments.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from sst_ros.scene import torque_profile as torques
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.schema import Rules, Section, build, entry
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import Array, Quaternion
+from sst_ros.state import NANOSECONDS, Array, Quaternion
 
 if TYPE_CHECKING:
     from sst_ros.recording.recording import Recording
 
 
 Known: TypeAlias = NDArray[np.bool_]
-"""Of each interval between samples whether its torque is known."""
+"""Whether the torque of each interval between samples is known."""
 
 Measured: TypeAlias = Union["Recording", Trajectory, Mapping[str, Any]]
 
@@ -38,6 +38,9 @@ Measured: TypeAlias = Union["Recording", Trajectory, Mapping[str, Any]]
 FEWEST = 20
 GAP = 10.0  # periods without a sample from which a motion is cut
 EVEN = 1e-3  # share of a period by which even samples may be off
+CLOCK_STEP_NS = 1.0  # of the times of ticks [ns]
+_SHOWN_GAPS = 5  # in a note
+# torques that are constant from break to break
 _HELD = (torques.TorqueTable, torques.ConstantTorque)
 
 
@@ -80,12 +83,8 @@ class MeasuredMotion(Section):
     def rules(self) -> Rules:
         """Refuse times that do not rise, few samples, and other numbers of rows."""
         n = len(self.t)
-        yield (
-            not torques.ascend(self.t),
-            "t",
-            self.t,
-            "must be rising times [s], shape (n,)",
-        )
+        rising = torques.ascend(self.t)
+        yield not rising, "t", self.t, "must be rising times [s], shape (n,)"
         yield n < FEWEST, "t", n, f"must be {FEWEST} samples or more"
         rows = {"gamma": n, "torque": n - self.held, "gamma_dot": n, "mu": n, "beta": n}
         for name, count in rows.items():
@@ -103,53 +102,50 @@ class Segments(NamedTuple):
 
 
 def read_motion(data: Measured) -> MeasuredMotion:
-    """Read a motion from a recording, a trajectory, or arrays, or refuse it.
+    """Read a motion from a recording, a trajectory, or arrays; see `identify`.
 
-    What is allowed is described in `identify`.
+    Raises InputError where it is none.
     """
-    return _read(data)[0]
+    return _read(data).motion
 
 
 def read_segments(data: Measured) -> Segments:
     """Read a motion as `read_motion`, cut where samples or torques are lost."""
-    motion, is_known, turns = _read(data)
-    notes = [turns] if turns else []
+    motion, is_known, notes = _read(data)
     spacing = np.diff(motion.t)
     cuts = np.flatnonzero((spacing > GAP * np.median(spacing)) | ~is_known)
     bounds = [0, *(cuts + 1).tolist(), len(motion.t)]
-    spans = [(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST]
+    spans = [(first, end) for first, end in pairwise(bounds) if end - first >= FEWEST]
     if len(cuts):
-        lost = ", ".join(
-            f"{t:g} s" for t in (motion.t[cuts] - motion.t[0]).tolist()[:5]
-        )
-        ellipsis = ", ..." if len(cuts) > 5 else ""
+        times = (motion.t[cuts] - motion.t[0]).tolist()
+        lost = ", ".join(f"{t:g} s" for t in times[:_SHOWN_GAPS])
+        ellipsis = ", ..." if len(times) > _SHOWN_GAPS else ""
         text = (
             f"samples or torques are lost after {lost}{ellipsis}: {len(spans)} segments"
             " are fitted"
         )
-        notes.append(text)
+        notes = (*notes, text)
     if not spans:
         requirement = f"must have {FEWEST} samples or more without a gap"
         raise refusal("identify", "t", len(motion.t), requirement)
-    return Segments(
-        motion, tuple(_cut(motion, first, end) for first, end in spans), tuple(notes)
-    )
+    parts = tuple(_cut(motion, first, end) for first, end in spans)
+    return Segments(motion, parts, notes)
 
 
 def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
     """Return the motion at even times, without rates, and a note of it.
 
-    As it is where it is even.
-
-    Angles, and torques that are not held, are interpolated by a cubic spline; held
-    torques are averaged.
+    Samples that are even already stay as they are, and the note is empty. Angles, and
+    torques that are not held, are interpolated by a cubic spline; held torques are
+    averaged.
     """
     t = motion.t - motion.t[0]  # seconds since an epoch have few digits left
     spacing = np.diff(t)
     period = float(np.median(spacing))
-    if np.abs(spacing - period).max() <= EVEN * period + 2.0 * np.spacing(motion.t[-1]):
+    rounding = 2.0 * np.spacing(motion.t[-1])
+    if np.abs(spacing - period).max() <= EVEN * period + rounding:
         return replace(motion, t=np.linspace(0.0, t[-1], len(t)), gamma_dot=None), ""
-    count = int(t[-1] / period * (1.0 + 1e-12)) + 1
+    count = int(t[-1] / period * (1.0 + 1e-12)) + 1  # to the last sample, to rounding
     even: Array = period * np.arange(count, dtype=float)
     gamma = CubicSpline(t, motion.gamma)(even)
     if motion.held:
@@ -164,43 +160,47 @@ def resample(motion: MeasuredMotion) -> tuple[MeasuredMotion, str]:
     return replace(motion, t=even, gamma=gamma, torque=torque, **passive), note
 
 
-def _read(data: Measured) -> tuple[MeasuredMotion, Known, str]:
-    """Read a motion.
+class _Reading(NamedTuple):
+    motion: MeasuredMotion
+    is_known: Known
+    notes: tuple[str, ...]  # what was unwrapped
 
-    Say of each interval whether its torque is known, and what was unwrapped.
-    """
+
+def _read(data: Measured) -> _Reading:
+    """Read a motion, with angles whose whole turns are taken out."""
     arrays: dict[str, Any]
-    is_known: Known | None
+    is_known: Known | None = None
     if isinstance(data, Mapping):
-        arrays, is_known = dict(data), None
+        arrays = dict(data)
     else:
         arrays, is_known = _take_samples(data)
     arrays = {name: value for name, value in arrays.items() if value is not None}
     motion = build(MeasuredMotion, arrays, "identify")
     if is_known is None:
         is_known = np.full(len(motion.t) - 1, True)
-    jumps = np.argwhere(np.abs(np.diff(motion.gamma, axis=0)) > np.pi)
-    if not len(jumps):
-        return motion, is_known, ""
-    row, leg = jumps[0].tolist()
+    wraps = np.argwhere(np.abs(np.diff(motion.gamma, axis=0)) > np.pi)
+    if not len(wraps):
+        return _Reading(motion, is_known, ())
+    row, leg = wraps[0].tolist()
     step = float(motion.gamma[row + 1, leg] - motion.gamma[row, leg])
-    text = (
-        f"angles wrap {len(jumps)} times, gamma_{leg + 1} first by {step:+.3f} rad at"
+    note = (
+        f"angles wrap {len(wraps)} times, gamma_{leg + 1} first by {step:+.3f} rad at"
         f" row {row + 1}: whole turns are taken out"
     )
-    return replace(motion, gamma=np.unwrap(motion.gamma, axis=0)), is_known, text
+    unwrapped = replace(motion, gamma=np.unwrap(motion.gamma, axis=0))
+    return _Reading(unwrapped, is_known, (note,))
 
 
 def _cut(motion: MeasuredMotion, first: int, end: int) -> MeasuredMotion:
     """Return the samples from the first up to the end, and the torques between them."""
-    rows = slice(first, end)
-    chosen: dict[str, Any] = {
-        name: None if (array := getattr(motion, name)) is None else array[rows]
-        for name in ("t", "gamma", "gamma_dot", "mu", "beta")
-    }
-    torque = motion.torque[first : end - motion.held]
-    quaternion = motion.quaternion if first == 0 else None
-    return replace(motion, **chosen, torque=torque, quaternion=quaternion)
+    changed: dict[str, Any] = {"torque": motion.torque[first : end - motion.held]}
+    for name in ("t", "gamma", "gamma_dot", "mu", "beta"):
+        array = getattr(motion, name)
+        if array is not None:
+            changed[name] = array[first:end]
+    if first > 0:  # the orientation is that of the first sample
+        changed["quaternion"] = None
+    return replace(motion, **changed)
 
 
 def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
@@ -210,83 +210,81 @@ def _take_samples(data: Recording | Trajectory) -> tuple[dict[str, Any], Known]:
     each interval is known. Rates of a run count only where they are those of its
     motion: what was measured has noise, and its rates more than its angles.
     """
-    if not isinstance(data, Trajectory) and hasattr(data, "measured"):
+    if isinstance(data, Trajectory):
+        return _take_simulated(data)
+    if hasattr(data, "measured"):
         return _take_measured(data)
-    if not isinstance(data, Trajectory):
-        requirement = (
-            "must be a recording or its path, a Trajectory, or a mapping of arrays"
-        )
-        raise refusal("identify", "data", data, requirement)
-    motion, law = data, data.law
-    t, torque = motion.t, motion.torque
+    requirement = (
+        "must be a recording or its path, a Trajectory, or a mapping of arrays"
+    )
+    raise refusal("identify", "data", data, requirement)
+
+
+def _take_simulated(motion: Trajectory) -> tuple[dict[str, Any], Known]:
+    """Take a simulated motion, whose torques are not known in its gaps."""
+    t = motion.t
+    law = motion.law
+    torque = motion.torque
     # With a lag the torques at the joints are behind those of the law: they are
     # samples.
     held = not motion.scene.lags and (law is None or isinstance(law, _HELD))
-    if held:  # without a law to their sample, see `Trajectory`
-        torque = torque[1:] if law is None else _average(law, t)
-    begin, end = t[:-1, None], t[1:, None]
-    lost: Known = np.any(
-        (begin < motion.gaps[:, 1]) & (end > motion.gaps[:, 0]), axis=1
-    )
-    return {
+    if held and law is None:  # held to their sample, see `Trajectory`
+        torque = torque[1:]
+    elif held and law is not None:
+        torque = _average(law, t)
+    gap_begins, gap_ends = motion.gaps.T
+    overlaps = (t[:-1, None] < gap_ends) & (t[1:, None] > gap_begins)
+    is_lost: Known = np.any(overlaps, axis=1)
+    samples = {
         "t": t,
         "gamma": np.unwrap(motion.gamma, axis=0),
         "gamma_dot": motion.gamma_dot,
         "torque": torque,
         "quaternion": next(iter(motion.quaternion), None),
         "held": held,
-    }, ~lost
+    }
+    return samples, ~is_lost
 
 
 def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     """Take what was measured in a recorded run, while its torques are known."""
-    passive: tuple[Array | None, Array | None] = (None, None)
-    # samples without an orientation are none of the motion
+    signals: dict[str, Array]
     if run.motion is run.measured:
-        motion = run.trajectory
-        t, gamma, rates, effort = (
-            motion.t,
-            motion.gamma,
-            motion.gamma_dot,
-            motion.torque,
-        )
+        motion = run.trajectory  # without samples that have no orientation
         quaternions = motion.quaternion
+        signals = {
+            "t": motion.t,
+            "gamma": motion.gamma,
+            "gamma_dot": motion.gamma_dot,
+            "torque": motion.torque,
+        }
     else:
         sensed = run.measured
-        t, gamma, rates, effort = (
-            sensed.time_ns / 1e9,
-            sensed.gamma,
-            None,
-            sensed.effort,
-        )
-        nearest = np.searchsorted(run.time_ns[:-1], sensed.time_ns)
-        passive, quaternions = (sensed.mu, sensed.beta), run.quaternion[nearest]
+        quaternions = run.quaternion[np.searchsorted(run.time_ns[:-1], sensed.time_ns)]
+        signals = {
+            "t": sensed.time_ns / NANOSECONDS,
+            "gamma": sensed.gamma,
+            "torque": sensed.effort,
+            "mu": sensed.mu,
+            "beta": sensed.beta,
+        }
     ticks = run.ticks
-    begins, ends = ticks.start_ns / 1e9, ticks.end_ns / 1e9
-    rows = (t >= begins[0] - 1e-12) & (t <= ends[-1] + 1e-12)
-    t, held = t[rows], not run.scene.lags
-    torque = (
-        _average(torques.TorqueTable(begins, ticks.torque), t) if held else effort[rows]
-    )
-    # How long torques are known from the start on, up to each sample.
-    edges = np.stack([begins, ends], axis=1).ravel()
-    lengths = np.stack([ends - begins, np.zeros(len(begins))], axis=1).ravel()
-    so_far = np.append(0.0, np.cumsum(lengths))[:-1]
-    is_known = np.diff(np.interp(t, edges, so_far)) > np.diff(t) - 1e-9
-    quaternion = next(iter(quaternions[rows]), None)
-    if quaternion is not None and not np.isfinite(quaternion).all():
-        quaternion = None
-    mu, beta = (None if angles is None else angles[rows] for angles in passive)
-    return {
-        "t": t,
-        "gamma": np.unwrap(gamma[rows], axis=0),
-        "gamma_dot": None if rates is None else rates[rows],
-        "torque": torque,
-        "quaternion": quaternion,
-        "mu": mu,
-        "beta": beta,
-        "held": held,
-    }, is_known
+    begins = ticks.start_ns / NANOSECONDS
+    ends = ticks.end_ns / NANOSECONDS
+    all_times = signals["t"]
+    rows = (all_times >= begins[0] - 1e-12) & (all_times <= ends[-1] + 1e-12)
+    samples: dict[str, Any] = {name: array[rows] for name, array in signals.items()}
+    t = samples["t"]
+    held = not run.scene.lags
+    if held:
+        samples["torque"] = _average(torques.TorqueTable(begins, ticks.torque), t)
+    samples["held"] = held
+    samples["gamma"] = np.unwrap(samples["gamma"], axis=0)
+    first_quaternion = next(iter(quaternions[rows]), None)
+    if first_quaternion is not None and np.isfinite(first_quaternion).all():
+        samples["quaternion"] = first_quaternion
+    times_ns = t * NANOSECONDS
+    return samples, ticks.known_between(times_ns) > np.diff(times_ns) - CLOCK_STEP_NS
 
 
 def _average(law: torques.TorqueProfile, t: Array) -> Array:
@@ -298,7 +296,8 @@ def _average(law: torques.TorqueProfile, t: Array) -> Array:
         return np.empty((0, 3))
     breaks = law.kinks()
     edges = np.union1d(t, breaks[(breaks > t[0]) & (breaks < t[-1])])
-    areas = law.values(0.5 * (edges[1:] + edges[:-1])) * np.diff(edges)[:, None]
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    areas = law.values(middles) * np.diff(edges)[:, None]
     # Sums over one interval each: a difference of long sums would lose digits.
     total = np.add.reduceat(areas, np.searchsorted(edges, t[:-1]), axis=0)
     return np.asarray(total / np.diff(t)[:, None])
@@ -315,21 +314,22 @@ def take_angles(
     t = measured.t - measured.t[0]
     # a recording: torques before the lag, which the model has
     if hasattr(data, "ticks"):
-        begins = np.round(data.ticks.start_ns / 1e9 - measured.t[0], 9)
+        begins = np.round(data.ticks.start_ns / NANOSECONDS - measured.t[0], 9)
         return torques.TorqueTable(begins, data.ticks.torque), t, measured.gamma
     # A simulated motion as well, while its torques are known: not of the state, and not
     # lost.
-    if (
-        isinstance(data, Trajectory)
-        and data.t[0] == 0.0
-        and data.scene.lags <= scene.lags
-    ):
-        law, limit = data.law, data.scene.torque_limit or np.inf
-        if law and np.isfinite(values := law.values(t)).all():
-            if limit == (scene.torque_limit or np.inf) or np.abs(values).max() <= limit:
+    if isinstance(data, Trajectory) and data.law is not None and data.t[0] == 0.0:
+        law = data.law
+        values = law.values(t)
+        if data.scene.lags <= scene.lags and np.isfinite(values).all():
+            limit = data.scene.torque_limit or np.inf
+            same_limit = limit == (scene.torque_limit or np.inf)
+            if same_limit or np.abs(values).max() <= limit:
                 return law, t, measured.gamma
-            held = isinstance(law, _HELD)  # cut off by a limit that the model has not
-            acted = np.clip(_average(law, t) if held else values, -limit, limit)
+            # cut off by a limit that the model has not
+            held = isinstance(law, _HELD)
+            requested = _average(law, t) if held else values
+            acted = np.clip(requested, -limit, limit)
             measured = replace(measured, torque=acted, held=held)
     if measured.held:
         return torques.TorqueTable(t[:-1], measured.torque), t, measured.gamma

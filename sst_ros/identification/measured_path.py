@@ -27,6 +27,8 @@ from sst_ros.mechanism import continuation, kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
 from sst_ros.scene.scene import Scene
 
+_FILTER_ORDER = 4  # of the Butterworth filter
+_SPLINE_DEGREE = 5  # accelerations are its second derivative, and are smooth
 # Highest frequency of the sines over the bandwidth of the motion: products of rates
 # double the frequencies of torques. From 2 to 5, 95 % intervals cover 0.90 to 0.99 in
 # 200 long recordings; the bias of short ones grows.
@@ -38,11 +40,23 @@ CONTINUATION_STEP = 0.03
 APART = 0.05
 # largest difference [rad] of the first angles from those of a given orientation
 NEAR = 0.1
-MOST_POSES = 100  # of the kinetic energy
+ENERGY_POSES = 100  # at which the kinetic energy is taken, about
 GAUSS_POINT = 1.0 / np.sqrt(3.0)  # of the rule of two points, over half an interval
 UNEVEN = 1e-3  # share of a period by which stamps of filtered angles may be off
 # samples at both ends at which an interpolating quintic spline has not its full order
 _EDGE = 8
+# share of the power of the angles' changes that lies within their bandwidth
+BANDWIDTH_POWER = 1.0 - 1e-4
+# Default cut-off over the rate of samples, at most: half the rate is the limit.
+HIGHEST_CUTOFF = 0.4
+
+
+class PathEquations(NamedTuple):
+    """torque = known + columns parameters, at m samples or of m components."""
+
+    torque: Array  # measured [N m], shape (m, 3)
+    known: Array  # of the scene without the parameters [N m], shape (m, 3)
+    columns: Array  # shape (m, 3, p)
 
 
 class EnergySums(NamedTuple):
@@ -113,7 +127,7 @@ class MeasuredPath:
             bandwidth = find_bandwidth(float(np.median(np.diff(t))), measured.gamma)
             band = min(BAND * bandwidth, cutoff or np.inf)
             smooth, unsettled = filter_angles(t, measured.gamma, cutoff)
-            angle = make_interp_spline(t, smooth, k=5)
+            angle = make_interp_spline(t, smooth, k=_SPLINE_DEGREE)
             curves = angle, angle.derivative(), angle.derivative(2)
             return cls(measured, space, curves, unsettled, band), note
         t = measured.t - measured.t[0]
@@ -121,8 +135,8 @@ class MeasuredPath:
             angle = CubicHermiteSpline(t, measured.gamma, rate)
             curves = angle, angle.derivative(), angle.derivative(2)
             return cls(measured, space, curves, 0, None), ""
-        angle = make_interp_spline(t, measured.gamma, k=5)
-        rates = make_interp_spline(t, rate, k=5)
+        angle = make_interp_spline(t, measured.gamma, k=_SPLINE_DEGREE)
+        rates = make_interp_spline(t, rate, k=_SPLINE_DEGREE)
         curves = angle, rates, rates.derivative()
         return cls(measured, space, curves, min(_EDGE, len(t) // 4), None), ""
 
@@ -134,14 +148,14 @@ class MeasuredPath:
 
     def evaluate(
         self, regressor: Regressor, delay: float, longest: float
-    ) -> tuple[Array, Array, Array]:
+    ) -> PathEquations:
         """Evaluate the equation of motion at the samples.
 
-        Where torques are held, its means are evaluated. Returns known and measured
-        torques [N m], each shape (m, 3), between them the regressor of p parameters,
-        shape (m, 3, p). Angles were measured a delay [s] late. Angles that no assembly
+        Where torques are held, its means are evaluated. Angles were measured a delay
+        [s] late. No delay up to the longest leaves the samples. Angles that no assembly
         has are refused.
         """
+        # a whole number of periods needs no more samples for its rounding
         cut = self._unsettled + int(np.ceil(longest / self.period * (1.0 - 1e-9)))
         rows = slice(cut, max(len(self.times) - cut, cut))
         times = self.times[rows]
@@ -150,12 +164,14 @@ class MeasuredPath:
         refuse_unless("identify", ("t", duration, len(times) > 1, requirement))
         angles, rates, accelerations = self._at(times.ravel() + delay)
         quaternion = self._orientations(angles)
-        star = self._star_accelerations(quaternion, rates, accelerations)
-        known, columns = regressor(quaternion, star[:, :3], star[:, 3:])
-        return (
-            _mean_of_points(known, times),
-            _mean_of_points(columns, times),
-            self.measured.torque[rows],
+        body_rate, body_acceleration = self._star_motion(
+            quaternion, rates, accelerations
+        )
+        known, columns = regressor(quaternion, body_rate, body_acceleration)
+        return PathEquations(
+            torque=self.measured.torque[rows],
+            known=_mean_of_points(known, times),
+            columns=_mean_of_points(columns, times),
         )
 
     def sum_energies(self, regressor: Regressor, delay: float) -> EnergySums:
@@ -164,17 +180,19 @@ class MeasuredPath:
         It is half the rates times the torques that, from rest and without gravity, give
         accelerations of the size of the rates.
         """
-        step = max(len(self.times) // MOST_POSES, 1)
+        step = max(len(self.times) // ENERGY_POSES, 1)
         late_times = self.times[:, 0] + delay
         inside = (late_times >= self.times[0, 0]) & (late_times <= self.times[-1, -1])
         angles, rates, _ = self._at(late_times[inside][::step])
         quaternion = _follow_orientations(self._space, angles, self.measured)
         zeros = np.zeros((len(angles), 3))
-        star = self._star_accelerations(quaternion, zeros, rates)
-        moved_known, moved_columns = regressor(quaternion, zeros, star[:, 3:])
-        held_known, held_columns = regressor(quaternion, zeros, zeros)
-        known = moved_known - held_known
-        columns = moved_columns - held_columns
+        _, acceleration = self._star_motion(quaternion, zeros, rates)
+        accelerated_known, accelerated_columns = regressor(
+            quaternion, zeros, acceleration
+        )
+        still_known, still_columns = regressor(quaternion, zeros, zeros)
+        known = accelerated_known - still_known
+        columns = accelerated_columns - still_columns
         return EnergySums(
             known=0.5 * float(np.sum(rates * known)),
             slopes=0.5 * np.einsum("nk,nkp->p", rates, columns),
@@ -186,12 +204,14 @@ class MeasuredPath:
         angle, rate, acceleration = self._curves
         return angle(times), rate(times), acceleration(times)
 
-    def _star_accelerations(
+    def _star_motion(
         self, quaternion: Array, rates: Array, accelerations: Array
-    ) -> Array:
-        """Return W and W_dot of the star side by side, shape (n, 6)."""
+    ) -> tuple[Array, Array]:
+        """Return W and W_dot of the star, each shape (n, 3)."""
         motion = *quaternion.T, *rates.T, *accelerations.T
-        return np.stack(self._space.star_accelerations(*motion), axis=1)
+        star = np.stack(self._space.star_accelerations(*motion), axis=1)
+        rate, acceleration = np.split(star, 2, axis=1)
+        return rate, acceleration
 
     def _orientations(self, gamma: Array) -> Array:
         """Quaternions (n, 4) at gamma (n, 3), which differ by a delay between calls.
@@ -201,10 +221,8 @@ class MeasuredPath:
         """
         if self._followed is not None:
             last_gamma, last_quaternion = self._followed
-            if (
-                last_gamma.shape == gamma.shape
-                and np.abs(gamma - last_gamma).max() <= CONTINUATION_STEP
-            ):
+            same_samples = last_gamma.shape == gamma.shape
+            if same_samples and np.abs(gamma - last_gamma).max() <= CONTINUATION_STEP:
                 return self._space.orientations(last_quaternion, gamma)
         quaternion = _follow_orientations(self._space, gamma, self.measured)
         self._followed = gamma, quaternion
@@ -234,7 +252,8 @@ def _check_passive(
     for name, angles in passive.items():
         if angles is None:
             continue
-        turns = np.exp(1j * (angles - np.stack(getattr(of_gamma, name), axis=1)))
+        expected = np.stack(getattr(of_gamma, name), axis=1)
+        turns = np.exp(1j * (angles - expected))  # without whole turns
         apart = float(np.median(np.abs(np.angle(turns)).max(axis=1)))
         refuse_unless(
             "identify", (name, f"{apart:.3g} rad off", apart <= APART, requirement)
@@ -247,10 +266,13 @@ def _follow_orientations(
     """Quaternions (n, 4) at gamma (n, 3) in the assembly mode of the first sample.
 
     A given orientation says which one that is: measured angles are only near those of
-    it.
+    it. Some of the angles, no more than CONTINUATION_STEP apart along the path where
+    the samples allow it, are followed by continuation; Newton's method takes all others
+    from the nearest of them before.
     """
     first = measured.gamma[:1]
-    length = np.cumsum(np.linalg.norm(np.diff(gamma, axis=0, prepend=first), axis=1))
+    steps = np.diff(gamma, axis=0, prepend=first)
+    length = np.cumsum(np.linalg.norm(steps, axis=1))
     marks = np.arange(0.0, length[-1] + CONTINUATION_STEP, CONTINUATION_STEP)
     knots = np.unique(np.searchsorted(length, marks))
     points = np.vstack([first, gamma[knots[knots < len(gamma)]]])
@@ -280,23 +302,22 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
     period = float(np.median(spacing))
     even = np.abs(spacing - period).max() <= UNEVEN * period
     if cutoff is None:
-        cutoff = min(CUTOFF_MARGIN * find_bandwidth(period, gamma), 0.4 / period)
-    settled = int(np.ceil(1.0 / (cutoff * period))) if cutoff > 0.0 else 0
-    least = 4 * settled + 10
+        usual = CUTOFF_MARGIN * find_bandwidth(period, gamma)
+        cutoff = min(usual, HIGHEST_CUTOFF / period)
+    settled = 0
+    if cutoff > 0.0:  # else refused below
+        settled = int(np.ceil(1.0 / (cutoff * period)))  # a period of the cut-off
+    least = 4 * settled + 10  # what is left is at least as long as both ends
     slow = f"must be > 0 and below half the rate of samples, {0.5 / period:g} Hz"
     lasting = f"must last {least * period:g} s or more at {cutoff:g} Hz"
+    uneven = "must be evenly spaced (to 0.1 %) for angles to be filtered"
     refuse_unless(
         "identify",
-        (
-            "t",
-            spacing,
-            even,
-            "must be evenly spaced (to 0.1 %) for angles to be filtered",
-        ),
+        ("t", spacing, even, uneven),
         ("cutoff", cutoff, 0.0 < cutoff < 0.5 / period, slow),
         ("t", float(t[-1] - t[0]), len(t) >= least, lasting),
     )
-    sections = butter(4, cutoff, fs=1.0 / period, output="sos")
+    sections = butter(_FILTER_ORDER, cutoff, fs=1.0 / period, output="sos")
     smooth = sosfiltfilt(sections, gamma, axis=0, padlen=min(3 * settled, len(t) - 1))
     return np.asarray(smooth), settled
 
@@ -304,10 +325,13 @@ def filter_angles(t: Array, gamma: Array, cutoff: float | None) -> tuple[Array, 
 def find_bandwidth(period: float, gamma: Array) -> float:
     """Return the frequency [Hz] below which the angles have their power.
 
-    That is all but 1e-4 of the power of their changes.
+    That is BANDWIDTH_POWER of the power of their changes, and at least the lowest
+    frequency of the samples.
     """
-    spread = (gamma - gamma.mean(axis=0)) * np.hanning(len(gamma))[:, None]
-    power = np.sum(np.abs(np.fft.rfft(spread, axis=0)) ** 2, axis=1)
+    window = np.hanning(len(gamma))[:, None]  # both ends are alike: zero
+    changes = (gamma - gamma.mean(axis=0)) * window
+    power = np.sum(np.abs(np.fft.rfft(changes, axis=0)) ** 2, axis=1)
     share = np.cumsum(power) / max(float(power.sum()), 1e-300)
     frequencies = np.fft.rfftfreq(len(gamma), period)
-    return float(frequencies[max(int(np.searchsorted(share, 1.0 - 1e-4)), 1)])
+    highest = int(np.searchsorted(share, BANDWIDTH_POWER))
+    return float(frequencies[max(highest, 1)])

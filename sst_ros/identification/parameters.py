@@ -24,7 +24,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +37,12 @@ from sst_ros.dynamics.traced_dynamics import (
 from sst_ros.errors import Check, refuse_unless, suggestion
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
-from sst_ros.programs.expression import compile_for_arrays, mark_present, trace
+from sst_ros.programs.expression import (
+    compile_for_arrays,
+    divide,
+    mark_present,
+    trace,
+)
 from sst_ros.report.results import render
 from sst_ros.scene.loads import Friction
 from sst_ros.scene.scene import LINKS, Scene
@@ -52,45 +56,71 @@ NEGLIGIBLE = 1e-12  # friction coefficient below which a scene has no such frict
 # which it counts as one of them: between rounding (1e-13) and the least of any
 # mechanism tried (1e-4).
 DEPENDENT = 1e-8
-ROUNDED = 1e-10  # share of a column's length that is rounding
-INERTIA_ENTRIES = ("xx", "yy", "zz", "xy", "xz", "yz")
-STANDARD = (
-    "mass",
-    *(f"moment.{axis}" for axis in "xyz"),
-    *(f"inertia.{part}" for part in INERTIA_ENTRIES),
+ROUNDED = 1e-10  # share of a column's length, and of a coefficient, that is rounding
+# Random motions that show the base parameters of a mechanism: so many that their
+# equations outnumber the parameters several times, with the sizes of usual motions.
+RANDOM_POSES = 300
+INNER_STROKE = (0.1, 0.9)  # shares of the stroke between which the poses lie
+RANDOM_RATE = 2.0  # standard deviation of W [rad/s]
+RANDOM_ACCELERATION = 20.0  # of W_dot [rad/s^2]
+# Poses nearer to a singularity are left out: their torques would outweigh all others.
+REGULAR_DET_J2 = 0.05
+REGULAR_SIN_MU = 0.1
+
+FIRST_MOMENTS = ("moment.x", "moment.y", "moment.z")
+INERTIA_ENTRIES = (
+    "inertia.xx",
+    "inertia.yy",
+    "inertia.zz",
+    "inertia.xy",
+    "inertia.xz",
+    "inertia.yz",
 )
+STANDARD = ("mass", *FIRST_MOMENTS, *INERTIA_ENTRIES)
 """The ten inertial parameters of a body about O, in the order of a body's columns."""
+
+OFFSETS = ("offset[0]", "offset[1]", "offset[2]")
+ROTOR_INERTIA = "actuators.rotor_inertia"
 
 
 def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ...]:
     """Return names of parameters of a scene: all, or the `requested` ones.
 
-    A name counts that begins as in ("star", "friction.gamma", "offset"); a beginning of
-    none is refused.
+    A request is how names begin, as "star", "friction.gamma" or "offset". Raises
+    InputError where no name begins so.
     """
     own, optional = _list_names(scene)
     if requested is None:
         return tuple(own)
+    beginnings = [requested] if isinstance(requested, str) else requested
+    selectable = dict.fromkeys(own + optional)
     names: dict[str, None] = {}
-    checks, selectable = list[Check](), dict.fromkeys(own + optional)
-    for begin in [requested] if isinstance(requested, str) else requested:
-        matches = [
-            name
-            for name in selectable
-            if re.match(re.escape(str(begin)) + r"($|\.|\[)", name)
-        ]
-        if str(begin) in LINKS:  # the three alike
-            matches = [name for name in matches if "[" not in name]
-        hint = "" if matches else suggestion(str(begin), selectable)
+    checks: list[Check] = []
+    for beginning in beginnings:
+        matches = _match(str(beginning), selectable)
+        hint = "" if matches else suggestion(str(beginning), selectable)
         requirement = f"begins no parameter of the scene{hint}"
-        checks.append(("parameters", begin, bool(matches), requirement))
+        checks.append(("parameters", beginning, bool(matches), requirement))
         names |= dict.fromkeys(matches)
     for link in LINKS:
-        forms = {name.removeprefix(link)[:1] for name in names if name.startswith(link)}
+        alike = any(name.startswith(f"{link}.") for name in names)
+        single = any(name.startswith(f"{link}[") for name in names)
         requirement = f"name {link} alike, or {link}[0] to {link}[2], not both"
-        checks.append(("parameters", link, len(forms) <= 1, requirement))
+        checks.append(("parameters", link, not (alike and single), requirement))
     refuse_unless("identify", *checks)
     return tuple(names)
+
+
+def _match(beginning: str, names: Iterable[str]) -> list[str]:
+    """Return the names that begin with whole words or indices as given.
+
+    The name of a kind of links means the three alike.
+    """
+    pattern = re.compile(re.escape(beginning) + r"($|\.|\[)")
+    matches = [name for name in names if pattern.match(name)]
+    if beginning in LINKS:
+        return [name for name in matches if "[" not in name]
+    return matches
 
 
 def values(scene: Scene, names: Sequence[str]) -> Array:
@@ -100,23 +130,28 @@ def values(scene: Scene, names: Sequence[str]) -> Array:
     """
     numbers = []
     for name in names:
-        body, moment, _ = name.partition(".moment.")
-        mass = (find_number(scene, f"{body}.mass") or 0.0) if moment else 1.0
-        numbers.append(mass * (find_number(scene, _of_centre(name)) or 0.0))
+        factor = 1.0
+        body, is_moment, _ = name.partition(".moment.")
+        if is_moment:
+            factor = find_number(scene, f"{body}.mass") or 0.0
+        numbers.append(factor * (find_number(scene, _key_of(name)) or 0.0))
     return np.array(numbers)
 
 
-def _of_centre(name: str) -> str:
-    """Return the key of the component of a centre that a moment has."""
-    return re.sub(r"moment\.([xyz])$", lambda m: f"centre[{'xyz'.index(m[1])}]", name)
+def _key_of(name: str) -> str:
+    """Return the key in a scene that makes a parameter: of a moment, the centre's."""
+    body, is_moment, axis = name.partition(".moment.")
+    if not is_moment:
+        return name
+    return f"{body}.centre[{'xyz'.index(axis)}]"
 
 
 def with_parameters(
     scene: Scene, names: Sequence[str], numbers: Array, note: str
 ) -> Scene:
-    """Return the scene with identified values, or refuse them.
+    """Return the scene with identified values, and a note of their provenance.
 
-    A note of their provenance is added.
+    Raises InputError where no bodies have these values.
     """
     by_name = dict(zip(names, (float(number) for number in numbers), strict=True))
     changed: dict[str, Any] = {}
@@ -124,11 +159,12 @@ def with_parameters(
         body, _, entry = name.partition(".")
         if entry.startswith("moment."):
             mass = by_name.get(f"{body}.mass", find_number(scene, f"{body}.mass"))
-            centre = [by_name.get(f"{body}.moment.{axis}", 0.0) for axis in "xyz"]
-            changed[f"{body}.centre"] = (
-                [h / mass for h in centre] if mass else [0.0] * 3
-            )
-        elif not name.startswith("offset"):
+            centre = [0.0, 0.0, 0.0]
+            if mass:
+                moments = (by_name.get(f"{body}.{key}", 0.0) for key in FIRST_MOMENTS)
+                centre = [moment / mass for moment in moments]
+            changed[f"{body}.centre"] = centre
+        elif name not in OFFSETS:
             changed[name] = number
     document = replace_values(plain(scene), changed)
     for terms in document.get("friction", {}).values():
@@ -144,38 +180,45 @@ def with_parameters(
 def _list_names(scene: Scene) -> tuple[list[str], list[str]]:
     """List names of what the scene has, and of what may be asked for besides.
 
-    Equal links are named alike. What may be asked for besides are links alone or alike,
-    friction that is not yet known, and offsets.
+    Three equal links of a scene have one name. Besides, links may be asked for alone or
+    alike, and so may friction and rotors that the scene does not have, and offsets.
     """
-    entries = STANDARD if scene.gravity is not None else STANDARD[4:]
-
-    def name_parts(*bodies: str) -> list[str]:
-        massive = (body for body in bodies if values_at(scene, f"{body}.inertia"))
-        return [f"{body}.{entry}" for body in massive for entry in entries]
-
-    own, optional = name_parts("star"), list[str]()
+    own = _list_inertial(scene, "star")
+    optional: list[str] = []
     for link in LINKS:
-        each, alike = (
-            name_parts(*(f"{link}[{k}]" for k in range(3))),
-            name_parts(f"{link}[0]"),
-        )
-        alike = [name.replace("[0]", "") for name in alike]
-        first, *following = values_at(scene, link)[0]
-        own += alike if following == [first, first] else each
-        optional += each + alike
-    terms = [
-        f"friction.{link}.{entry}" for link in JOINT_KINDS for entry in Friction.EFFECTS
+        alike = [
+            name.replace("[0]", "") for name in _list_inertial(scene, f"{link}[0]")
+        ]
+        single: list[str] = []
+        for leg in range(3):
+            single += _list_inertial(scene, f"{link}[{leg}]")
+        first, second, third = values_at(scene, link)[0]
+        own += alike if first == second == third else single
+        optional += single + alike
+    friction = [
+        f"friction.{kind}.{effect}"
+        for kind in JOINT_KINDS
+        for effect in Friction.EFFECTS
     ]
     springs = [f"springs[{i}].stiffness" for i in range(len(scene.springs))]
-    own += filter(
-        partial(find_number, scene), [*terms, *springs, "actuators.rotor_inertia"]
-    )
-    optional += (name for name in terms if not name.endswith("static"))
-    return own, [
-        *optional,
-        "actuators.rotor_inertia",
-        *(f"offset[{k}]" for k in range(3)),
-    ]
+    for name in (*friction, *springs, ROTOR_INERTIA):
+        if find_number(scene, name):
+            own.append(name)
+    optional += (name for name in friction if not name.endswith("static"))
+    optional += (ROTOR_INERTIA, *OFFSETS)
+    return own, optional
+
+
+def _list_inertial(scene: Scene, body: str) -> list[str]:
+    """List the names of the inertial parameters of a body, none if it has no inertia.
+
+    Without gravity torques do not depend on mass and first moments: the star turns
+    about O.
+    """
+    if not values_at(scene, f"{body}.inertia"):
+        return []
+    entries = INERTIA_ENTRIES if scene.gravity is None else STANDARD
+    return [f"{body}.{entry}" for entry in entries]
 
 
 @dataclass(frozen=True)
@@ -225,7 +268,7 @@ class Identification(ReadOnly):
         It has standard deviations, and what the motion leaves open.
         """
         rows = zip(self.before, self.estimate, self.deviation, self.labels, strict=True)
-        return render("identification.txt", found=self, rows=rows)
+        return render("identification.txt", fit=self, rows=rows)
 
 
 class Regressor:
@@ -235,37 +278,42 @@ class Regressor:
     """
 
     def __init__(self, scene: Scene, names: Sequence[str]) -> None:
-        self.scene, self.names = scene, tuple(names)
+        self.scene = scene
+        self.names = tuple(names)
         traced = [
-            n for n in self.names if not n.startswith("offset") and n[-5:] != ".mass"
+            name
+            for name in self.names
+            if name not in OFFSETS and not name.endswith(".mass")
         ]
-        geometry, document = Geometry.of(scene), plain(scene)
-        # Torques depend on mass times centre alone: bodies of mass 1 have it as their
-        # centre.
-        for body in (
-            document["star"],
-            *(link for kind in LINKS for link in document[kind]),
-        ):
-            body["centre"] = [
-                body["mass"] * coordinate for coordinate in body["centre"]
-            ]
-            body["mass"] = 1.0
-
-        def torques(*inputs: Any) -> tuple[Any, ...]:
-            varied = zip(
-                map(_of_centre, traced), map(mark_present, inputs[10:]), strict=True
-            )
-            opened = build_unchecked(Scene, replace_values(document, dict(varied)))
-            model = kernel.model_of(opened, geometry)
-            return kernel.actuator_torque(model, inputs[:4], inputs[4:7], inputs[7:10])[
-                0
-            ]
-
+        keys = [_key_of(name) for name in traced]
+        geometry = Geometry.of(scene)
+        document = _with_unit_masses(scene)
         symbols = tuple(f"p{i}" for i in range(len(traced)))
         inputs = (*QUATERNION_SYMBOLS, *RATE_SYMBOLS, *BODY_ACCELERATION, *symbols)
+        sizes = {
+            "quaternion": len(QUATERNION_SYMBOLS),
+            "rate": len(RATE_SYMBOLS),
+            "acceleration": len(BODY_ACCELERATION),
+            "parameters": len(symbols),
+        }
+
+        def torques(*numbers: Any) -> tuple[Any, ...]:
+            """Return the torques of a motion with given values of the parameters."""
+            given = divide(sizes, numbers)
+            values = map(mark_present, given["parameters"])
+            varied = dict(zip(keys, values, strict=True))
+            opened = build_unchecked(Scene, replace_values(document, varied))
+            torque, _ = kernel.actuator_torque(
+                kernel.model_of(opened, geometry),
+                given["quaternion"],
+                given["rate"],
+                given["acceleration"],
+            )
+            return torque
+
         self._torques = compile_for_arrays(trace(torques, inputs, symbols))
-        places = [self.names.index(name) for name in traced]
-        self._traced = np.array(places, dtype=int)
+        indices = [self.names.index(name) for name in traced]
+        self._traced = np.array(indices, dtype=int)
         is_spring = [name.startswith("springs") for name in self.names]
         self._springs = np.array(is_spring, dtype=bool)
 
@@ -281,15 +329,32 @@ class Regressor:
         # A stiffness of zero leaves no rest angle: springs are evaluated at 1 N m/rad.
         stiffness = self._springs[self._traced].astype(float)
         outputs = self._torques(*quaternion.T, *rate.T, *acceleration.T, *stiffness)
-        rows = np.stack([np.broadcast_to(row, (count,)) for row in outputs]).reshape(
-            -1, 3, count
-        )
+        rows = [np.broadcast_to(row, (count,)) for row in outputs]
+        # the torques, then their derivative by each parameter
+        torque, *slopes = np.stack(rows).reshape(-1, 3, count)
         columns = np.zeros((count, 3, len(self.names)))
-        columns[:, :, self._traced] = rows[1:].T
-        for i, name in enumerate(self.names):
-            if name.startswith("offset"):
-                columns[:, int(name[7]), i] = 1.0
-        return rows[0].T - columns[:, :, self._springs].sum(axis=2), columns
+        for index, slope in zip(self._traced, slopes, strict=True):
+            columns[:, :, index] = slope.T
+        for leg, name in enumerate(OFFSETS):
+            if name in self.names:
+                columns[:, leg, self.names.index(name)] = 1.0
+        return torque.T - columns[:, :, self._springs].sum(axis=2), columns
+
+
+def _with_unit_masses(scene: Scene) -> dict[str, Any]:
+    """Return the document of a scene with the same first moments and masses of 1 kg.
+
+    Torques depend on mass times centre alone: bodies of mass 1 have it as their centre.
+    """
+    document = dict(plain(scene))
+    bodies = [document["star"]]
+    for link in LINKS:
+        bodies += document[link]
+    for body in bodies:
+        mass = body["mass"]
+        body["centre"] = [mass * coordinate for coordinate in body["centre"]]
+        body["mass"] = 1.0
+    return document
 
 
 class BaseParameters(NamedTuple):
@@ -314,20 +379,18 @@ def find_base_parameters(regressor: Regressor, seed: int = 0) -> BaseParameters:
     The regressor is taken at random admissible poses within the stroke, rates and
     accelerations.
     """
-    geometry, rng = Geometry.of(regressor.scene), np.random.default_rng(seed)
-    poses = kinematics.direct_many(
-        geometry, rng.uniform(0.1, 0.9, (300, 3)) * geometry.arc
+    geometry = Geometry.of(regressor.scene)
+    rng = np.random.default_rng(seed)
+    stroke_shares = rng.uniform(*INNER_STROKE, (RANDOM_POSES, 3))
+    poses = kinematics.direct_many(geometry, stroke_shares * geometry.arc)
+    is_regular = np.abs(poses.det_j2) > REGULAR_DET_J2
+    is_regular &= np.all(np.sin(poses.mu) > REGULAR_SIN_MU, 1)
+    quaternion = quaternion_of(poses.rotation[poses.admissible & is_regular])
+    rate, acceleration = rng.normal(size=(2, len(quaternion), 3))
+    _, columns = regressor(
+        quaternion, RANDOM_RATE * rate, RANDOM_ACCELERATION * acceleration
     )
-    regular = (
-        poses.admissible
-        & (np.abs(poses.det_j2) > 0.05)
-        & np.all(np.sin(poses.mu) > 0.1, 1)
-    )
-    quaternion = quaternion_of(poses.rotation[regular])
-    rate, acceleration = rng.normal(size=(2, len(quaternion), 3)) * [[[2.0]], [[20.0]]]
-    return find_independent(
-        regressor(quaternion, rate, acceleration)[1], regressor.names
-    )
+    return find_independent(columns, regressor.names)
 
 
 def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
@@ -347,15 +410,14 @@ def find_independent(columns: Array, names: Sequence[str]) -> BaseParameters:
     solved = np.linalg.lstsq(scaled[:, chosen], scaled, rcond=None)[0]
     solved[np.abs(solved) < ROUNDED] = 0.0
     transform = np.zeros((len(chosen), len(names)))
-    transform[:, nonzero] = (
-        solved * lengths[nonzero] / lengths[nonzero[chosen]][:, None]
-    )
+    chosen_lengths = lengths[nonzero[chosen]]
+    transform[:, nonzero] = solved * lengths[nonzero] / chosen_lengths[:, None]
     indices: list[int] = nonzero[chosen].tolist()
     labels = [names[i] for i in indices]
     for (row, i), factor in np.ndenumerate(transform):
         if factor and i != indices[row]:
-            coefficient = (
-                "" if abs(abs(factor) - 1.0) <= ROUNDED else f"{abs(factor):.4g} "
-            )
-            labels[row] += f" {'-' if factor < 0.0 else '+'} {coefficient}{names[i]}"
+            sign = "-" if factor < 0.0 else "+"
+            size = abs(factor)
+            coefficient = f"{size:.4g} " if abs(size - 1.0) > ROUNDED else ""
+            labels[row] += f" {sign} {coefficient}{names[i]}"
     return BaseParameters(tuple(labels), indices, transform)

@@ -9,8 +9,9 @@ are not linear: Gauss-Newton takes it, beside the base parameters.
 from __future__ import annotations
 
 import copy
+import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import dst
@@ -25,7 +26,7 @@ from sst_ros.identification.consistency import (
 )
 from sst_ros.identification.contradictions import Relabelling
 from sst_ros.identification.measured_motion import MeasuredMotion
-from sst_ros.identification.measured_path import MeasuredPath
+from sst_ros.identification.measured_path import MeasuredPath, PathEquations
 from sst_ros.identification.parameters import BaseParameters, Regressor
 from sst_ros.mechanism.geometry import Array
 
@@ -67,7 +68,7 @@ class WeightedFit(NamedTuple):
 
 
 class FormedEquations(NamedTuple):
-    """torque = known + columns parameters, of samples, or of their components."""
+    """The equations of all segments: see `PathEquations`."""
 
     torque: Array  # measured [N m], shape (m, 3)
     known: Array  # of the scene without the parameters [N m], shape (m, 3)
@@ -79,9 +80,7 @@ class FormedEquations(NamedTuple):
 
 
 class RegressionEquations:
-    """The equation of motion along measured segments.
-
-    It is a function of the delay of the angles.
+    """The equation of motion along measured segments, at any delay of the angles.
 
     Attributes:
         regressor: known torques, and columns of the parameters.
@@ -136,17 +135,16 @@ class RegressionEquations:
 
     def _find_late(self, noise: Sequence[float] | None) -> list[str]:
         """Return a note where angles that are taken as in time are late, or early."""
-        late = self._fit_with_delay(0.0, noise, self._period)
-        deviation = late.delay_deviation or 0.0
-        if abs(late.delay) < max(
-            contradictions.CERTAIN * deviation, LATE * self._period
-        ):
+        fitted = self._fit_with_delay(0.0, noise, self._period)
+        certain = contradictions.CERTAIN * (fitted.delay_deviation or 0.0)
+        delay = abs(fitted.delay)
+        if delay < max(certain, LATE * self._period):
             return []
-        direction = "late" if late.delay > 0.0 else "early"
+        direction = "late" if fitted.delay > 0.0 else "early"
         return [
             f"angles seem to be {direction} against the torques, by some "
-            f"{1e3 * abs(late.delay):.2g} ms: give the delay, or leave out gamma_dot, "
-            "so that it is estimated"
+            f"{1e3 * delay:.2g} ms: give the delay, or leave out gamma_dot, so that it "
+            "is estimated"
         ]
 
     def _find_delay(self, noise: Sequence[float] | None, longest: float) -> WeightedFit:
@@ -170,7 +168,7 @@ class RegressionEquations:
         """
         formed = self._form(delay, longest)
         base = self._find_base(formed)
-        estimate, root, spread = fit_weighted(
+        fit = fit_weighted(
             formed.columns[..., base.chosen],
             formed.torque - formed.known,
             noise,
@@ -178,7 +176,14 @@ class RegressionEquations:
             frequencies=formed.frequencies,
         )
         return WeightedFit(
-            base, estimate, root, spread, formed.samples, delay, None, formed.notes
+            base=base,
+            estimate=fit.estimate,
+            root=fit.root,
+            noise=fit.noise,
+            samples=formed.samples,
+            delay=delay,
+            delay_deviation=None,
+            notes=formed.notes,
         )
 
     def _fit_with_delay(
@@ -263,19 +268,21 @@ class RegressionEquations:
         Returns the mean energy [J] of the measured motion by the estimates, its
         standard deviation, and that of the given scene.
 
-        Parameters that the motion does not determine are those nearest to the given.
+        Parameters x that the motion does not determine are those nearest to the given
+        x_0 in sizes of the bodies: the least (x - x_0)^T S^-1 (x - x_0), of squared
+        sizes S, under T x = beta is x = x_0 + S T^T (T S T^T)^-1 (beta - T x_0).
         """
         names = self.regressor.names
         sums = [path.sum_energies(self.regressor, fitted.delay) for path in self._paths]
         count = sum(each.samples for each in sums)
         known = sum(each.known for each in sums) / count
         slopes = np.sum([each.slopes for each in sums], axis=0) / count
-        values = parameters.values(self.regressor.scene, names)
+        scene_values = parameters.values(self.regressor.scene, names)
         transform = fitted.base.transform
-        weighted = transform * scales(names, values) ** 2  # T S of the lift S T^T
+        weighted = transform * scales(names, scene_values) ** 2  # T S
         by_estimate = np.linalg.solve(weighted @ transform.T, weighted @ slopes)
-        expected = known + float(slopes @ values)
-        change = by_estimate @ (fitted.estimate - transform @ values)
+        expected = known + float(slopes @ scene_values)
+        change = by_estimate @ (fitted.estimate - transform @ scene_values)
         deviation = np.linalg.norm(
             solve_triangular(fitted.root, by_estimate, trans="T")
         )
@@ -290,19 +297,20 @@ class RegressionEquations:
         relabellings are fitted that leave the least noise in a fit linearized at no
         delay.
         """
-        trials = list[tuple[float, Relabelling, RegressionEquations]]()
+        trials: list[tuple[float, RegressionEquations, Relabelling]] = []
         for relabelling in contradictions.RELABELLINGS:
             trial = copy.copy(self)
             trial._relabelling = relabelling
             rough = trial._fit_roughly(noise, delay)
-            trials.append((float(np.linalg.norm(rough.noise)), relabelling, trial))
-        trials.sort(key=lambda row: row[0])
-        for _, relabelling, trial in trials[:MOST_TRIALS]:
+            trials.append((float(np.linalg.norm(rough.noise)), trial, relabelling))
+        trials.sort(key=operator.itemgetter(0))
+        alike = LIKE_NOISE * np.linalg.norm(fitted.noise)
+        for _, trial, relabelling in trials[:MOST_TRIALS]:
             refitted = trial.fit(noise, delay)
-            alike = LIKE_NOISE * np.linalg.norm(fitted.noise)
             if np.linalg.norm(refitted.noise) >= alike:
                 continue
-            if trial.find_bodies(refitted)[1] <= SIGNIFICANT:
+            _, excess = trial.find_bodies(refitted)
+            if excess <= SIGNIFICANT:
                 requirement = (
                     f"fit no bodies, but {relabelling.columns} do: must be those of"
                     " gamma"
@@ -346,31 +354,36 @@ class RegressionEquations:
         return formed._replace(torque=self._relabelling.apply(formed.torque))
 
     def _evaluate(self, delay: float, longest: float) -> FormedEquations:
-        scene = self.regressor.scene
-        names = self.regressor.names
-        limit = np.inf
-        if scene.torque_limit is not None:
-            limit = scene.torque_limit * (1.0 - 1e-9)
-        rows = list[tuple[Array, Array, Array]]()
-        frequencies = list[Array]()
-        total = samples = 0
+        """Evaluate the equations of each segment, and put them together.
+
+        Samples at which a torque is at the limit of the actuators are left out.
+        """
+        parameter_count = len(self.regressor.names)
+        # one segment alone must determine all parameters
+        least_sines = parameter_count if len(self._paths) == 1 else 0
+        of_paths: list[PathEquations] = []
+        frequencies: list[Array] = []
+        total = 0
+        samples = 0
         for path in self._paths:
-            known, columns, torque = path.evaluate(self.regressor, delay, longest)
-            sound = np.abs(torque).max(axis=1) < limit
-            equations = torque[sound], known[sound], columns[sound]
-            count = int(sound.sum())
-            total += len(sound)
+            equations = path.evaluate(self.regressor, delay, longest)
+            is_sound = np.abs(equations.torque).max(axis=1) < self._torque_limit
+            count = int(is_sound.sum())
+            total += len(is_sound)
             samples += count
+            equations = PathEquations(*(array[is_sound] for array in equations))
             if path.band is not None:
-                least = len(names) if len(self._paths) == 1 else 0
-                equations = _transform(equations, path.count_sines(count, least))
-                sines = np.arange(1, len(equations[0]) + 1)
+                equations = _transform(equations, path.count_sines(count, least_sines))
+                sines = np.arange(1, len(equations.torque) + 1)
                 frequencies.append(sines / (2.0 * path.period * (count + 1)))
-            rows.append(equations)
+            of_paths.append(equations)
         requirement = (
-            f"must leave more than {len(names)} samples for {len(names)} parameters"
+            f"must leave more than {parameter_count} samples for {parameter_count}"
+            " parameters"
         )
-        refuse_unless("identify", ("t", samples, samples > len(names), requirement))
+        refuse_unless(
+            "identify", ("t", samples, samples > parameter_count, requirement)
+        )
         notes: tuple[str, ...] = ()
         if samples < total:
             warning = (
@@ -382,20 +395,23 @@ class RegressionEquations:
         if frequencies:
             relative = np.concatenate(frequencies)
             relative = relative / relative.max()
-        torques, known_torques, columns_of_paths = zip(*rows, strict=True)
         return FormedEquations(
-            torque=np.concatenate(torques),
-            known=np.concatenate(known_torques),
-            columns=np.concatenate(columns_of_paths),
+            torque=np.concatenate([equations.torque for equations in of_paths]),
+            known=np.concatenate([equations.known for equations in of_paths]),
+            columns=np.concatenate([equations.columns for equations in of_paths]),
             frequencies=relative,
             samples=samples,
             notes=notes,
         )
 
+    @property
+    def _torque_limit(self) -> float:
+        """Torque [N m] below which an actuator is not at its limit, to rounding."""
+        limit = self.regressor.scene.torque_limit
+        return np.inf if limit is None else limit * (1.0 - 1e-9)
 
-def _transform(equations: tuple[Array, Array, Array], count: int) -> Any:
+
+def _transform(equations: PathEquations, count: int) -> PathEquations:
     """Return the components of samples along the first sines."""
-    return tuple(
-        np.asarray(dst(samples, type=1, norm="ortho", axis=0)[:count])
-        for samples in equations
-    )
+    spectra = (dst(array, type=1, norm="ortho", axis=0) for array in equations)
+    return PathEquations(*(np.asarray(spectrum[:count]) for spectrum in spectra))

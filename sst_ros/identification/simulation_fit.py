@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from sst_ros.dynamics.kernel import joints, model_of
+from sst_ros.dynamics.kernel import Model, joints, model_of
 from sst_ros.dynamics.variational import VariationalEquations
 from sst_ros.errors import InputError, refuse_unless
 from sst_ros.identification import contradictions, parameters
@@ -26,17 +26,19 @@ from sst_ros.identification.regression import RegressionEquations
 from sst_ros.mechanism.geometry import Array
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import find_number
+from sst_ros.state import STAR
 
+# keys of numbers that must stay positive: of what has a size, not a direction
 POSITIVE = re.compile(
     r"(friction|actuators|stroke|springs)(?!.*\.rest$)|.*\.(mass|xx|yy|zz)$"
 )
 LEAST_SHARE = 1e-3  # of its given value that a positive parameter may fall to
 NOT_DETERMINED = 1.0  # relative standard deviation of a combination that counts as such
-SINGULAR = 1e-12  # share of the largest singular value that is rounding
+ROUNDED_SINGULAR_VALUE = 1e-12  # share of the largest one that is rounding
 LARGEST_DEVIATION = 1e9  # relative, in the covariance of what nothing determines
 SHOWN_POWER = 0.05  # of a combination, over its largest, that is written
-TOLERANCE = 1e-13  # of least squares, relative: they end at rounding
-MOST_EVALUATIONS = 100
+LEAST_SQUARES_TOLERANCE = 1e-13  # relative: the iteration ends at rounding
+MOST_EVALUATIONS = 100  # of the motion, by least squares
 
 
 @dataclass(frozen=True)
@@ -74,48 +76,26 @@ def fit_simulation(
     of the parameters, their singular values over the measuring errors show which
     combinations are known and how well: often fewer than there are parameters.
     """
-    names: tuple[str, ...] = ()
-    if isinstance(requested, str):
-        names = (requested,)
-    elif requested is not None:
-        names = tuple(requested)
-    requirement = "must be keys of numbers of the scene, with method simulation"
-    refuse_unless("identify", ("parameters", requested, bool(names), requirement))
+    names = _named(requested)
     notes = _check_simulated(data, scene)
-    torque, t, gamma = take_angles(data, scene)
+    torque, times, gamma = take_angles(data, scene)
     motion = VariationalEquations(scene, names, torque, caller="identify")
     model = model_of(scene)
     start = np.array([find_number(scene, name) for name in names], dtype=float)
-    positive = [bool(POSITIVE.match(name)) for name in names]
-    least = np.where(positive, LEAST_SHARE, -np.inf)
-    requirement = "must not be 0 in the scene: it begins there, and must be > 0"
-    begins = (start > 0.0) | ~np.array(positive)
-    checks = zip(names, start, begins.tolist(), strict=True)
-    refuse_unless("identify", *((*check, requirement) for check in checks))
+    least = _least_shares(names, start)
     size = np.abs(start) + (start == 0.0)
 
     @lru_cache(maxsize=1)  # SciPy asks for residuals and slopes one after the other
-    def compare(*x: float) -> tuple[Array, Array]:
-        """Return computed less measured angles [rad], and derivatives.
-
-        The angles have the shape (3 n,), the derivatives (3 n, p).
-        """
-        states, slopes = motion.run(np.array(x) * size, t)
-        rows = states[:, :7].T
-        turned = np.exp(
-            1j * (np.stack(joints(model, tuple(rows)).gamma, axis=1) - gamma)
-        )
-        by_state = motion.differentiate_joints(rows)[:, :3]
-        changes = np.einsum("qcn,nqp->ncp", by_state, slopes[:, :7])
-        return np.angle(turned).ravel(), changes.reshape(-1, len(names))
+    def compare(*shares: float) -> tuple[Array, Array]:
+        return _compare_angles(motion, model, np.array(shares) * size, times, gamma)
 
     solution = least_squares(
-        lambda x: compare(*x)[0],
+        lambda shares: compare(*shares)[0],
         start / size,
-        lambda x: compare(*x)[1] * size,
+        lambda shares: compare(*shares)[1] * size,
         bounds=(least, np.inf),
-        xtol=TOLERANCE,
-        ftol=TOLERANCE,
+        xtol=LEAST_SQUARES_TOLERANCE,
+        ftol=LEAST_SQUARES_TOLERANCE,
         gtol=None,
         max_nfev=MOST_EVALUATIONS,
     )
@@ -128,7 +108,7 @@ def fit_simulation(
         warnings += (
             "no bodies have the inertias that fit best: the scene keeps the given ones",
         )
-    vague = combinations.directions[combinations.relative >= NOT_DETERMINED]
+    undetermined = combinations.directions[combinations.relative >= NOT_DETERMINED]
     return SimulationFit(
         scene=adjusted,
         names=names,
@@ -137,12 +117,58 @@ def fit_simulation(
         before=start,
         estimate=fitted,
         covariance=combinations.covariance,
-        undetermined=tuple(describe_combination(row, names) for row in vague),
+        undetermined=tuple(describe_combination(row, names) for row in undetermined),
         warnings=warnings,
         relative=combinations.relative,
         directions=combinations.directions,
         error=float(np.sqrt(np.mean(residuals**2))),
     )
+
+
+def _named(requested: Iterable[str] | None) -> tuple[str, ...]:
+    """Return the names of the parameters, of which there must be one or more."""
+    names: tuple[str, ...] = ()
+    if isinstance(requested, str):
+        names = (requested,)
+    elif requested is not None:
+        names = tuple(requested)
+    requirement = "must be keys of numbers of the scene, with method simulation"
+    refuse_unless("identify", ("parameters", requested, bool(names), requirement))
+    return names
+
+
+def _least_shares(names: tuple[str, ...], start: Array) -> Array:
+    """Return the least share of its given value that each parameter may have.
+
+    Raises InputError where one that must be positive is not.
+    """
+    is_positive = [bool(POSITIVE.match(name)) for name in names]
+    requirement = "must not be 0 in the scene: it begins there, and must be > 0"
+    may_begin = (start > 0.0) | ~np.array(is_positive)
+    checks = zip(names, start, may_begin.tolist(), strict=True)
+    refuse_unless("identify", *((*check, requirement) for check in checks))
+    return np.where(is_positive, LEAST_SHARE, -np.inf)
+
+
+def _compare_angles(
+    motion: VariationalEquations,
+    model: Model,
+    values: Array,
+    times: Array,
+    gamma: Array,
+) -> tuple[Array, Array]:
+    """Return computed less measured angles [rad], and their derivatives.
+
+    The angles have the shape (3 n,), their derivatives by the p values (3 n, p).
+    """
+    states, state_slopes = motion.run(values, times)
+    body_states = states[:, STAR].T  # without lagged torques
+    computed = np.stack(joints(model, tuple(body_states)).gamma, axis=1)
+    turned = np.exp(1j * (computed - gamma))  # without whole turns
+    by_state = motion.differentiate_joints(body_states)
+    gamma_by_state, _ = np.split(by_state, 2, axis=1)  # of gamma and of gamma_dot
+    slopes = np.einsum("qcn,nqp->ncp", gamma_by_state, state_slopes[:, STAR])
+    return np.angle(turned).ravel(), slopes.reshape(-1, len(values))
 
 
 class _Combinations(NamedTuple):
@@ -161,7 +187,7 @@ def _find_combinations(residuals: Array, slopes: Array, fitted: Array) -> _Combi
     noise = float(np.sqrt(np.sum(residuals**2) / freedom)) + 1e-300
     _, singular, rows = np.linalg.svd(slopes * scale / noise, full_matrices=True)
     relative = np.full(count, np.inf)
-    regular = singular > SINGULAR * max(float(singular[0]), 1e-300)
+    regular = singular > ROUNDED_SINGULAR_VALUE * max(float(singular[0]), 1e-300)
     relative[: len(singular)][regular] = 1.0 / singular[regular]
     variances = np.minimum(relative, LARGEST_DEVIATION) ** 2
     covariance = (rows.T * variances) @ rows * np.outer(scale, scale)

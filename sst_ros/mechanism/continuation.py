@@ -4,15 +4,16 @@
 Let A have the rows t_k x r_k, so that turning R by a small phi changes r_k . R e_k by A
 phi, and let sigma be its least singular value. Along a straight segment of length d in
 gamma the residual and the slope change by at most d, and second derivatives by phi are
-at most 1 a row. By the Newton-Kantorovich theorem (L = sqrt(3), beta = 1/(sigma - d),
-eta = beta d) a unique assembly exists near R for every point of the segment, and
-Newton's method from R finds it, as long as
+at most 1 a row. So sqrt(3) bounds how fast the slope changes, 1/(sigma - d) its
+inverse, and d/(sigma - d) the first step of Newton's method. By the Newton-Kantorovich
+theorem a unique assembly exists near R for every point of the segment, and Newton's
+method from R finds it, as long as
 
     sqrt(3) d / (sigma - d)^2 <= 1/2,   for which   d <= 0.18 sigma^2   is enough.
 
 So no step jumps to another branch, however near it is; steps shrink only toward a
-parallel singularity (sigma = 0). The edge of the workspace, beta_k = 0, is no place of
-interest here.
+parallel singularity (sigma = 0). Nothing happens here at the edge of the workspace,
+beta_k = 0.
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ from sst_ros.mechanism.kinematics import CLOSURE_ROUNDING, rotate
 
 SAFE_STEP = 0.18  # in gamma [rad] over sigma^2; a longer one might leave the branch
 LEAST_SIGMA = 1e-5  # at which a branch is followed
-CLOSED = 1e-9  # largest abs(r_k . t_k) of a rotation that is given as an assembly
-ITERATIONS = 20  # of Newton's method
+ASSEMBLY_RESIDUAL = (
+    1e-9  # largest abs(r_k . t_k) of a rotation that is given as an assembly
+)
+ITERATIONS = 20  # of Newton's method at most: it converges quadratically
 MOST_STEPS = 20_000  # between two points
 SQRT2 = 2.0**0.5
 
@@ -71,14 +74,15 @@ def follow(
 
     """
     points = np.array(gamma, dtype=float)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not np.all(np.isfinite(points)):
+    is_table = points.ndim == 2 and points.shape[1] == 3
+    if not is_table or not np.all(np.isfinite(points)):
         raise AssemblyError("gamma must be rows of three finite numbers", points)
     if rotation is None:
         rotation = kinematics.admissible(geometry, points[0]).rotation
     rotations = np.empty((len(points), 3, 3))
     rotations[0] = rotate(np.array(rotation, dtype=float), np.zeros(3))
     residual = kinematics.closure(geometry, points[0], rotations[0])
-    if np.abs(residual).max() > CLOSED:
+    if np.abs(residual).max() > ASSEMBLY_RESIDUAL:
         raise AssemblyError("rotation does not close the loops", points[0])
     rotations[0] = _newton(geometry, points[0], rotations[0])
     for row in range(1, len(points)):
@@ -133,7 +137,8 @@ def advance(
 
 def _least_singular(matrices: Array) -> Array:
     """Return the least singular values of matrices (..., 3, 3)."""
-    return np.asarray(np.linalg.svd(matrices, compute_uv=False)[..., -1], dtype=float)
+    descending = np.linalg.svd(matrices, compute_uv=False)
+    return np.asarray(descending[..., -1], dtype=float)
 
 
 def _slope(geometry: Geometry, gamma: Array, rotation: Array) -> Array:

@@ -25,7 +25,13 @@ ARRAYS = (np.ndarray, np.generic, complex)
 def _function_of(name: str) -> Callable[[Any], Any]:
     """Return a function of one number: that of `math`, or of the number's own kind."""
     of_float: Callable[[float], float] = getattr(math, name)
-    return lambda x: of_float(x) if type(x) is float else _apply_by_kind(name, x)
+
+    def of_any(x: Any) -> Any:
+        if type(x) is float:
+            return of_float(x)
+        return _apply_by_kind(name, x)
+
+    return of_any
 
 
 sqrt = _function_of("sqrt")
@@ -95,9 +101,13 @@ number below 2^13 is exact.
 TO_WHOLE = 1.5 * 2.0**52
 """A double as large has no fraction: to add and subtract it rounds to an integer."""
 
-_EXPM1_SERIES = tuple(1.0 / math.factorial(n) for n in range(2, 14))
-"""Coefficients of the exponential series from r^2 on. For abs(r) <= ln(2) / 2 the rest
-is less than 2e-17 of the sum.
+_EXPM1_SERIES = tuple(
+    tuple(1.0 / math.factorial(n) for n in range(first, first + 4))
+    for first in (2, 6, 10)
+)
+"""Coefficients of the exponential series from r^2 to r^13, in rows of four.
+
+For abs(r) <= ln(2) / 2 the terms that follow are less than 2e-17 of the sum.
 """
 
 _TANH_IS_ONE = 22.0
@@ -106,7 +116,9 @@ _TANH_IS_ONE = 22.0
 
 def tanh(x: Any) -> Any:
     """Hyperbolic tangent; of floats by `tanh_steps`."""
-    return tanh_steps(x) if type(x) is float else _apply_by_kind("tanh", x)
+    if type(x) is float:
+        return tanh_steps(x)
+    return _apply_by_kind("tanh", x)
 
 
 def tanh_steps(x: Scalar) -> Scalar:
@@ -124,15 +136,16 @@ def tanh_steps(x: Scalar) -> Scalar:
     size = absolute(x)
     exponent = -2.0 * select(size - _TANH_IS_ONE, _TANH_IS_ONE, size)
     k = (exponent * (1.0 / math.log(2.0)) + TO_WHOLE) - TO_WHOLE
-    r = (exponent - k * LN_2[0]) - k * LN_2[1]
+    ln_2, remainder = LN_2
+    r = (exponent - k * ln_2) - k * remainder
     square = r * r
     fourth = square * square
     # Pairs of pairs: half of the operations do not wait for each other.
     sums = []
-    for first in range(0, len(_EXPM1_SERIES), 4):
-        c0, c1, c2, c3 = _EXPM1_SERIES[first : first + 4]
+    for c0, c1, c2, c3 in _EXPM1_SERIES:
         sums.append((c0 + c1 * r) + square * (c2 + c3 * r))
-    series = (sums[0] + fourth * sums[1]) + (fourth * fourth) * sums[2]
+    low, middle, high = sums
+    series = (low + fourth * middle) + (fourth * fourth) * high
     scale = power_of_two(k)
     t = scale * (r + square * series) + (scale - 1.0)
     negative = t / (t + 2.0)
@@ -152,7 +165,8 @@ def _apply_by_kind(name: str, *arguments: Any) -> Any:
     if hasattr(first, "apply"):
         return first.apply(name)
     if isinstance(first, (*ARRAYS, int)):
-        return getattr(np, {"atan2": "arctan2"}.get(name, name))(*arguments)
+        numpy_name = "arctan2" if name == "atan2" else name
+        return getattr(np, numpy_name)(*arguments)
     import mpmath
 
     return getattr(mpmath, name)(*arguments)
@@ -162,10 +176,18 @@ def rotation_rows(q: Quadruple) -> Rows:
     """Rows of R for a quaternion (x, y, z, w) of any length > 0."""
     x, y, z, w = q
     s = 2.0 / (x * x + y * y + z * z + w * w)
-    sx, sy, sz = s * x, s * y, s * z
-    xx, yy, zz = sx * x, sy * y, sz * z
-    xy, xz, yz = sx * y, sx * z, sy * z
-    wx, wy, wz = sx * w, sy * w, sz * w
+    sx = s * x
+    sy = s * y
+    sz = s * z
+    xx = sx * x
+    yy = sy * y
+    zz = sz * z
+    xy = sx * y
+    xz = sx * z
+    yz = sy * z
+    wx = sx * w
+    wy = sy * w
+    wz = sz * w
     return (
         (1.0 - (yy + zz), xy - wz, xz + wy),
         (xy + wz, 1.0 - (xx + zz), yz - wx),
@@ -210,6 +232,13 @@ def multiply(factor: Scalar, a: Triple) -> Triple:
     return (factor * x, factor * y, factor * z)
 
 
+def subtract(a: Triple, b: Triple) -> Triple:
+    """Return a - b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return (ax - bx, ay - by, az - bz)
+
+
 def axpy(alpha: Scalar, a: Triple, beta: Scalar, b: Triple) -> Triple:
     """Return alpha a + beta b."""
     ax, ay, az = a
@@ -246,10 +275,25 @@ def solve_symmetric(matrix: Symmetric, right: Triple) -> Triple:
     return (fx / xx - l21 * x2 - l31 * x3, x2, x3)
 
 
+def transform(rows: Rows, vector: Triple) -> Triple:
+    """Return the matrix with these rows times a vector.
+
+    With the rows of R it turns a vector of {E} into {B}; with the axes of a frame it
+    gives the components along them.
+    """
+    return triple(dot3(row, vector) for row in rows)
+
+
 def rotate_back(rows: Rows, vector: Triple) -> Triple:
-    """R^T times a vector of {B}."""
+    """Return the transpose of the matrix with these rows times a vector.
+
+    With the rows of R it turns a vector of {B} into {E}; with the axes of a frame it
+    makes a vector of its components along them.
+    """
     x, y, z = vector
-    return triple(x * rows[0][i] + y * rows[1][i] + z * rows[2][i] for i in range(3))
+    first, second, third = rows
+    columns = zip(first, second, third, strict=True)
+    return triple(x * a + y * b + z * c for a, b, c in columns)
 
 
 def dot3(a: Triple, b: Triple) -> Scalar:

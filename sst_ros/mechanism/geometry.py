@@ -22,12 +22,14 @@ from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.state import Array as Array
 from sst_ros.state import Explained
 
-KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
+SCENE_KEYS = ("base.v", "star.alpha_deg", "workspace.beta_max_deg")
 """Numbers of a scene that its geometry is made from."""
 
 SMALL = 1000  # numbers of an array below which `take` is faster than slices
 NEXT = np.array([1, 2, 0])  # components after x, y, z
 LAST = np.array([2, 0, 1])  # components before them
+CYCLIC = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+"""Legs, or axes, each with the two that follow it."""
 
 
 def frozen(*arrays: Any) -> tuple[Any, ...]:
@@ -53,11 +55,13 @@ class Geometry(Explained):
     beta_max: Any  #: largest admissible beta_k [rad]
 
     def _facts(self) -> dict[str, object]:
-        arcs_deg, alpha_deg = np.degrees(self.arc), np.degrees(self.alpha)
+        arcs_deg = np.degrees(self.arc)
+        alpha_deg = np.degrees(self.alpha)
         facts: dict[str, object] = {}
-        if self.v.ndim > 2:
+        if self.v.ndim > 2:  # many geometries, of which the first is shown
             facts["geometries"] = len(self.v)
-            arcs_deg, alpha_deg = arcs_deg[0], alpha_deg[0]
+            arcs_deg = arcs_deg[0]
+            alpha_deg = alpha_deg[0]
         else:
             for leg, vertex in enumerate(self.v.tolist(), start=1):
                 facts[f"P{leg} in {{B}}, unit vector"] = vertex
@@ -89,7 +93,8 @@ class Geometry(Explained):
         """
         directions = np.array(v, dtype=float)
         shape = directions.shape
-        alpha_shape, beta_shape = np.shape(alpha), np.shape(beta_max)
+        alpha_shape = np.shape(alpha)
+        beta_shape = np.shape(beta_max)
         fits = shape[-2:] == (3, 3) and alpha_shape == shape[:-1]
         fits = fits and beta_shape in ((), shape[:-2])
         shapes = (shape, alpha_shape, beta_shape)
@@ -101,10 +106,11 @@ class Geometry(Explained):
         sines = np.linalg.norm(normals, axis=-1)
         cosines = np.einsum("...j,...j->...", directions, following)
         angles = np.array(alpha, dtype=float)
-        alpha_12, alpha_23 = angles[..., 0], angles[..., 1]
+        alpha_12 = angles[..., 0]
+        alpha_23 = angles[..., 1]
         zero = np.zeros_like(alpha_12)
-        turns = np.stack([zero, alpha_12, alpha_12 + alpha_23], axis=-1)
-        e = np.stack([-np.sin(turns), np.cos(turns), np.zeros_like(turns)], axis=-1)
+        turns = vectors(zero, alpha_12, alpha_12 + alpha_23)
+        e = vectors(-np.sin(turns), np.cos(turns), np.zeros_like(turns))
         w = normals / sines[..., None]
         arcs = np.arctan2(sines, cosines)
         largest: Any = beta_max if beta_shape else float(np.asarray(beta_max))
@@ -113,36 +119,33 @@ class Geometry(Explained):
 
     @classmethod
     def of_scenarios(cls, scenarios: Any) -> tuple[Geometry, NDArray[np.intp]]:
-        """Derive distinct geometries of `Scenarios`, and the index of each row's."""
+        """Derive the distinct geometries of `Scenarios`, and which each row has."""
         scene = scenarios.document
-        columns_by_key = [scenarios.rows.get(key) for key in KEYS]
+        columns_by_key = [scenarios.rows.get(key) for key in SCENE_KEYS]
         varied = []
         for values in columns_by_key:
             if values is not None:
                 varied.append(values.reshape(len(values), -1))
         if not varied:
             return cls.of(scene), np.zeros(scenarios.count or 1, dtype=np.intp)
-        _, first, index = np.unique(
+        _, first_rows, geometry_of_row = np.unique(
             np.hstack(varied), axis=0, return_index=True, return_inverse=True
         )
         nominal = scene.base.v, scene.star.alpha_deg, scene.workspace.beta_max_deg
         arrays = []
         for values, value in zip(columns_by_key, nominal, strict=True):
             if values is None:
-                arrays.append(np.repeat([value], len(first), axis=0))
+                arrays.append(np.repeat([value], len(first_rows), axis=0))
             else:
-                arrays.append(values[first])
+                arrays.append(values[first_rows])
         v, alpha_deg, beta_max_deg = arrays
         distinct = cls.build(v, np.radians(alpha_deg), np.radians(beta_max_deg))
-        if len(first) == 1:  # one for all rows: its numbers are no columns
+        if len(first_rows) == 1:  # one for all rows: its numbers are no columns
             distinct = cls.build(distinct.v[0], distinct.alpha[0], distinct.beta_max[0])
-        return distinct, index.ravel()
+        return distinct, geometry_of_row.ravel()
 
     def of_rows(self, rows: Any) -> Geometry:
-        """Return the geometries of rows, or of a row.
-
-        This one where it is a single one.
-        """
+        """Return the geometries of rows, or of a row; a single one is that of all."""
         if self.v.ndim == 2:
             return self
         return Geometry(*(array[rows] for array in vars(self).values()))
@@ -172,13 +175,16 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     if np.any(length == 0.0):
         raise ValueError("a quaternion of length zero is no rotation")
     x, y, z, w = np.moveaxis(q / length, -1, 0)
-    xx, yy, zz, ww = x * x, y * y, z * z, w * w
-    rows = (
-        (xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
-        (2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
-        (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -xx - yy + zz + ww),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    ww = w * w
+    rows = [
+        vectors(xx - yy - zz + ww, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+        vectors(2.0 * (x * y + z * w), -xx + yy - zz + ww, 2.0 * (y * z - x * w)),
+        vectors(2.0 * (x * z - y * w), 2.0 * (y * z + x * w), -xx - yy + zz + ww),
+    ]
+    return np.stack(rows, axis=-2)
 
 
 def quaternion_of(rotation: ArrayLike) -> Array:
@@ -192,8 +198,9 @@ def quaternion_of(rotation: ArrayLike) -> Array:
     trace = np.trace(m, axis1=-2, axis2=-1)
     w = 3  # index of the real part; i, j, k are those of the others
     # Row n is four times component n times the whole quaternion.
-    products = np.empty((*m.shape[:-2], 4, 4))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    *stack_shape, _, _ = m.shape
+    products = np.empty((*stack_shape, 4, 4))
+    for i, j, k in CYCLIC:
         products[..., i, i] = 1.0 - trace + 2.0 * m[..., i, i]
         products[..., i, j] = m[..., j, i] + m[..., i, j]
         products[..., i, k] = m[..., k, i] + m[..., i, k]
@@ -203,7 +210,8 @@ def quaternion_of(rotation: ArrayLike) -> Array:
     diagonal = np.diagonal(m, axis1=-2, axis2=-1)
     sizes = np.concatenate([diagonal, trace[..., None]], axis=-1)
     largest = np.argmax(sizes, axis=-1)
-    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    row = np.take_along_axis(products, largest[..., None, None], axis=-2)
+    q = np.squeeze(row, axis=-2)
     q = q / np.sqrt(np.sum(q * q, axis=-1, keepdims=True))
     signs = np.sign(np.roll(q, 1, axis=-1))  # w first
     first = np.argmax(signs != 0.0, axis=-1)
@@ -219,21 +227,22 @@ def zyz_angles(rotation: ArrayLike) -> Array:
     theta is 0 and psi carries it all.
     """
     r = np.asarray(rotation, dtype=float)
-    sine = np.hypot(r[..., 0, 2], r[..., 1, 2])
+    s_x, s_y, s_z = np.moveaxis(r[..., :, 2], -1, 0)
+    sine = np.hypot(s_x, s_y)
     pole = sine == 0.0
-    theta = np.where(pole, 0.0, np.arctan2(r[..., 1, 2], r[..., 0, 2]))
+    theta = np.where(pole, 0.0, np.arctan2(s_y, s_x))
     psi = np.where(
         pole,
         np.arctan2(r[..., 1, 0], r[..., 1, 1]),
         np.arctan2(r[..., 2, 1], -r[..., 2, 0]),
     )
-    return np.stack([theta, np.arctan2(sine, r[..., 2, 2]), psi], axis=-1)
+    return vectors(theta, np.arctan2(sine, s_z), psi)
 
 
 def unwrap_zyz(angles: ArrayLike) -> Array:
     """Return ZYZ angles [rad] of a trajectory without jumps, shape (n, 3).
 
-    The given angles are as from `zyz_angles`.
+    `angles` are as `zyz_angles` returns them.
 
     (theta, phi, psi) and (theta + pi, -phi, psi + pi) are the same rotation, so a
     motion straight through the pole is smooth in angles if phi may change its sign.
@@ -253,7 +262,7 @@ def unwrap_zyz(angles: ArrayLike) -> Array:
 
 
 def _nearest_form(angles: Array, reference: Array) -> Array:
-    """Return the form of ZYZ angles that is nearest to others, shape (3,) each."""
+    """Return the form of ZYZ angles that is nearest to a reference, shape (3,) each."""
     theta, phi, psi = angles
     half_turn = np.pi
     if phi in (0.0, np.pi):
@@ -263,8 +272,15 @@ def _nearest_form(angles: Array, reference: Array) -> Array:
         # Kept is theta + psi at phi = 0, theta - psi at phi = pi.
         psi = psi - shift if phi == 0.0 else psi + shift
     forms = np.array([[theta, phi, psi], [theta + half_turn, -phi, psi + half_turn]])
-    forms += 2.0 * np.pi * np.round((reference - forms) / (2.0 * np.pi))
-    return np.asarray(forms[np.argmin(np.abs(forms - reference).sum(axis=1))])
+    full_turn = 2.0 * np.pi
+    forms += full_turn * np.round((reference - forms) / full_turn)
+    distances = np.abs(forms - reference).sum(axis=1)
+    return np.asarray(forms[np.argmin(distances)])
+
+
+def star_direction(rotation: Array) -> Array:
+    """Return s, the direction of E in {B}: the third column of R, shape (..., 3)."""
+    return rotation[..., :, 2]
 
 
 def angle_between(first: ArrayLike, second: ArrayLike) -> Array:
@@ -295,8 +311,20 @@ def cross(a: Array, b: Array) -> Array:
 def dot(a: Array, b: Array) -> Array:
     """Scalar product along the last axis, of three; much faster than np.sum."""
     product = a * b
-    x, y, z = product[..., 0], product[..., 1], product[..., 2]
+    x = product[..., 0]
+    y = product[..., 1]
+    z = product[..., 2]
     return np.asarray(x + y + z)
+
+
+def norm(a: Array) -> Array:
+    """Length along the last axis, of three."""
+    return np.asarray(np.sqrt(dot(a, a)))
+
+
+def vectors(x: Array, y: Array, z: Array) -> Array:
+    """Vectors (..., 3) with the given components."""
+    return np.stack([x, y, z], axis=-1)
 
 
 def columns(a: Array, b: Array, c: Array) -> Array:

@@ -41,6 +41,7 @@ from sst_ros.mechanism.geometry import (
     cross,
     dot,
     frozen,
+    norm,
     quaternion_of,
 )
 from sst_ros.state import Assembly
@@ -50,11 +51,13 @@ Mask = NDArray[np.bool_]
 NEAR = 0.1  # how near an assembly must be to the rotation that names it [rad]
 CLOSURE_ROUNDING = 1e-15  # largest abs(r_k . t_k) that is rounding and not a residual
 NOT_ISOLATED = 1e-13  # quartic forms with smaller coefficients vanish identically
+# The next three choose what is polished and compared: larger ones cost time only,
+# smaller ones may lose a root.
 NEAR_REAL = 1e-3  # imaginary part, over 1 + abs(z)^2, of a root that may be real
 SAME_ROOT = 1e-3  # entries of two rotations that may be one root differ by less
 MISFIT = 1e-2  # residual of leg 2 or 3 at an angle y that is worth polishing
-POSE_NEWTON_STEPS = 40
-LONGEST_TURN = 0.3  # of a Newton step [rad]
+POSE_NEWTON_STEPS = 40  # at most: each halves the distance to a double root
+LONGEST_TURN = 0.3  # of a Newton step [rad]: a longer one may leave the root's vicinity
 LAST_STEP = 1e-9  # a Newton step [rad] after which rounding is reached
 REGULAR = 1e-5  # abs(det J2) above which a Newton step is solved by the adjugate
 SMALLEST = 1e-300  # divisor in place of zero
@@ -123,20 +126,16 @@ def inverse(
     InputError refuses other shapes.
     """
     matrices = np.asarray(rotation, dtype=float)
+    shape = matrices.shape
     refuse_unless(
         "inverse",
-        (
-            "rotation",
-            matrices.shape,
-            matrices.shape[-2:] == (3, 3),
-            "must be (..., 3, 3)",
-        ),
+        ("rotation", shape, shape[-2:] == (3, 3), "must be (..., 3, 3)"),
         ("signs", signs, np.shape(signs) == (3,), "must be three of 1 and -1"),
     )
     t = star_axes(geometry, matrices)
     s = matrices[..., None, :, 2]
     p = cross(t, geometry.w)
-    sine = np.sqrt(dot(p, p))
+    sine = norm(p)
     sign = np.asarray(signs, dtype=float)
     p = sign[:, None] * p
     across = cross(geometry.w, geometry.v)
@@ -160,11 +159,11 @@ def direct(geometry: Geometry, gamma: ArrayLike) -> list[Assembly]:
         raise AssemblyError("the assemblies are not isolated", angles)
     return [
         Assembly(
-            assemblies.rotation[row],
-            assemblies.mu[row],
-            assemblies.beta[row],
-            float(assemblies.det_j2[row]),
-            bool(assemblies.admissible[row]),
+            rotation=assemblies.rotation[row],
+            mu=assemblies.mu[row],
+            beta=assemblies.beta[row],
+            det_j2=float(assemblies.det_j2[row]),
+            admissible=bool(assemblies.admissible[row]),
         )
         for row in range(len(assemblies.rotation))
     ]
@@ -177,7 +176,8 @@ def direct_many(geometry: Geometry, gamma: ArrayLike) -> Assemblies:
     numbers.
     """
     angles = np.asarray(gamma, dtype=float)
-    if angles.ndim != 2 or angles.shape[1] != 3 or not np.all(np.isfinite(angles)):
+    is_table = angles.ndim == 2 and angles.shape[1] == 3
+    if not is_table or not np.all(np.isfinite(angles)):
         raise AssemblyError(
             "gamma must be three finite numbers, or rows of them", angles
         )
@@ -274,21 +274,24 @@ def describe_assemblies(
 
 
 def _solve_closure(r: Array, e: Array) -> tuple[Index, Array, Mask]:
-    """Solve r_k . R e_k = 0 for n configurations with r and e, (n, 3, 3) each.
+    """Solve r_k . R e_k = 0 for many configurations at once.
 
-    Rows are unit vectors, e_1 = (0, 1, 0). Returns the configuration of each root,
-    ascending, (m,); the rotations, (m, 3, 3), in the order of `direct`; and whether the
-    roots of a configuration are isolated, (n,): where they are not, none is given.
+    The letters are those of this module's docstring. r and e have the configuration
+    first, then rows of unit vectors by leg; e_1 = (0, 1, 0). Returns the configuration
+    of each root, ascending; the rotations, in the order of `direct`; and whether the
+    roots of each configuration are isolated: where they are not, none is given.
     """
     r_1 = r[:, 0]
     directions = r[:, 1:]  # r_2 and r_3
-    n = cross(r_1, np.eye(3)[np.argmin(np.abs(r_1), axis=1)])
+    least_axis = np.eye(3)[np.argmin(np.abs(r_1), axis=1)]  # far from r_1
+    n = cross(r_1, least_axis)
     n /= np.linalg.norm(n, axis=1)[:, None]
     m = cross(r_1, n)
     along_n = (directions @ n[:, :, None])[..., 0]
     along_m = (directions @ m[:, :, None])[..., 0]
     along_r = (directions @ r_1[:, :, None])[..., 0]
-    e_x, e_y = e[..., 1:, 0], e[..., 1:, 1]
+    e_x = e[..., 1:, 0]
+    e_y = e[..., 1:, 1]
     # For each configuration and legs 2 and 3: two coefficients, of cos x and sin x, in
     # a and c; one number in b.
     a = e_x[..., None] * np.stack([-along_m, along_n], axis=-1)
@@ -317,31 +320,37 @@ def _largest(rows: Array) -> Array:
     return np.asarray(np.maximum(np.maximum(first, second), third))
 
 
+# where the coefficients of a quadratic form are in one of degree four
+TIMES_COSINE_SQUARED = slice(0, 3)
+TIMES_SINE_SQUARED = slice(2, 5)
+
+
 def _quartic(a: Array, b: Array, c: Array) -> Array:
     """Coefficients of cos^4 x, cos^3 x sin x, ..., sin^4 x, shape (n, 5).
 
     The form is that of cos(y)^2 + sin(y)^2 - 1, where (cos y, sin y, 1) is the cross
     product of the rows (a, b, c) of legs 2 and 3.
     """
-    a_2, a_3 = a[:, 0], a[:, 1]
-    b_2, b_3 = b[:, :1], b[:, 1:]
-    c_2, c_3 = c[:, 0], c[:, 1]
+    a_2, a_3 = np.moveaxis(a, 1, 0)
+    b_2, b_3 = b.T[:, :, None]
+    c_2, c_3 = np.moveaxis(c, 1, 0)
     cosine = b_2 * c_3 - b_3 * c_2
     scale = a_2 * b_3 - a_3 * b_2
     sine = _product(c_2, a_3) - _product(a_2, c_3)
     form = _product(sine, sine)
     quadratic = _product(cosine, cosine) - _product(scale, scale)
     # The quadratic form becomes one of degree four by the factor cos^2 x + sin^2 x = 1.
-    form[:, :3] += quadratic  # times cos^2 x
-    form[:, 2:] += quadratic  # times sin^2 x
+    form[:, TIMES_COSINE_SQUARED] += quadratic
+    form[:, TIMES_SINE_SQUARED] += quadratic
     return form
 
 
 def _product(a: Array, b: Array) -> Array:
     """Products of forms, coefficients along the last axis."""
-    result = np.zeros((len(a), a.shape[1] + b.shape[1] - 1))
-    for power in range(a.shape[1]):
-        result[:, power : power + b.shape[1]] += a[:, power, None] * b
+    size = b.shape[1]
+    result = np.zeros((len(a), a.shape[1] + size - 1))
+    for power, coefficient in enumerate(a.T):
+        result[:, power : power + size] += coefficient[:, None] * b
     return result
 
 
@@ -350,7 +359,8 @@ def _turn_forms(count: int) -> tuple[Array, Array]:
     angles = np.arange(count) * np.pi / count
     matrices = np.zeros((count, 5, 5))
     for turn, angle in enumerate(angles):
-        cosine, sine = np.cos(angle), np.sin(angle)
+        cosine = np.cos(angle)
+        sine = np.sin(angle)
         for power in range(5):
             # cos^(4 - power) x sin^power x, each factor by cosine and sine of x - x_0
             term = np.ones(1)
@@ -375,11 +385,13 @@ def _roots(form: Array, isolated: Mask) -> tuple[Array, Mask]:
     divisor = np.where(isolated, turned[:, 0], 1.0)
     companion = np.zeros((len(form), 4, 4))
     companion[:, 0] = -turned[:, 1:] / divisor[:, None]
-    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    column = np.arange(3)
+    companion[:, column + 1, column] = 1.0
     z = np.linalg.eigvals(companion)
     square = z.real**2 + z.imag**2
     # z = cot(x - x_0)
-    x = TURN_ANGLES[best][:, None] + 0.5 * np.arctan2(2.0 * z.real, square - 1.0)
+    from_best = 0.5 * np.arctan2(2.0 * z.real, square - 1.0)
+    x = TURN_ANGLES[best][:, None] + from_best
     is_near_real = np.abs(z.imag) < NEAR_REAL * (1.0 + square)
     return x, isolated[:, None] & is_near_real
 
@@ -428,11 +440,14 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
         if not moves.any():
             break
         if not moves.all():
-            active, rotation = active[moves], rotation[moves]
-            r, e, t = r[moves], e[moves], t[moves]
+            active = active[moves]
+            rotation = rotation[moves]
+            r = r[moves]
+            e = e[moves]
+            t = t[moves]
             residual = residual[moves]
         step = _newton_step(cross(t, r), residual)
-        length = np.sqrt(dot(step, step))
+        length = norm(step)
         if length.max() > LONGEST_TURN:
             share = LONGEST_TURN / np.maximum(length, SMALLEST)
             step = step * np.minimum(1.0, share)[:, None]
@@ -442,7 +457,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
 
 def _newton_step(slope: Array, residual: Array) -> Array:
     """Solve slope step = -residual, by the shortest step where nearly singular."""
-    first, second, third = slope[:, 0], slope[:, 1], slope[:, 2]
+    first, second, third = np.moveaxis(slope, 1, 0)
     # A^-1 is the adjugate over the determinant; its columns are these vector products.
     adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
     determinant = dot(first, adjugate[:, :, 0])
@@ -463,9 +478,9 @@ def rotate(rotation: Array, step: Array) -> Array:
     """
     t = _turn_vector(rotation[..., 1], step)
     s = _turn_vector(rotation[..., 2], step)
-    s = s / np.sqrt(dot(s, s))[..., None]
+    s = s / norm(s)[..., None]
     t = t - s * dot(s, t)[..., None]
-    t = t / np.sqrt(dot(t, t))[..., None]
+    t = t / norm(t)[..., None]
     return columns(cross(t, s), t, s)
 
 
@@ -475,7 +490,7 @@ def _turn_vector(vector: Array, step: Array) -> Array:
 
 
 def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index, Array]:
-    """Keep one of each root; t_1 and -t_1 count as the same here."""
+    """Keep one solution of each root; those of t_1 and -t_1 count as one here."""
     if not len(owner):
         return owner, rotation
     fresh = np.ones(len(owner), dtype=bool)
@@ -487,7 +502,8 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
             continue
         new = rotation[later]
         old = rotation[later - back]
-        sign = np.where(dot(new[:, :, 1], old[:, :, 1]) < 0.0, -1.0, 1.0)
+        along = dot(new[:, :, 1], old[:, :, 1])  # of the vectors t_1
+        sign = np.where(along < 0.0, -1.0, 1.0)
         partner = np.stack([sign, sign, np.ones_like(sign)], axis=1)
         old = old * partner[:, None, :]
         close = np.abs(new - old).max(axis=(1, 2)) < SAME_ROOT
@@ -501,7 +517,7 @@ def _distinct(r: Array, e: Array, owner: Index, rotation: Array) -> tuple[Index,
 
 
 def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
-    """Sort, and set the partner R Rot(z, pi) beside each root."""
+    """Sort the roots, and insert the partner R Rot(z, pi) beside each."""
     s_x, s_y, s_z = np.round(rotation[:, :, 2], SORTED_DIGITS).T
     order = np.lexsort((s_x, s_y, s_z, owner))
     owner = owner[order]
@@ -510,7 +526,8 @@ def _arrange(owner: Index, rotation: Array) -> tuple[Index, Array]:
     # t_1 first, then -t_1: first the one further along the first base vector where they
     # differ.
     t_1 = np.round(rotation[:, :, 1], SORTED_DIGITS)
-    first_entry = t_1[np.arange(len(t_1)), np.argmax(t_1 != 0.0, axis=1)]
+    component = np.argmax(t_1 != 0.0, axis=1)
+    first_entry = t_1[np.arange(len(t_1)), component]
     is_behind = (first_entry < 0.0)[:, None, None]
     leading = np.where(is_behind, partner, rotation)
     pairs = np.stack([leading, leading * HALF_TURN], axis=1)

@@ -31,25 +31,30 @@ from numpy.typing import ArrayLike, NDArray
 from sst_ros.errors import check_kinds, read_numbers, refuse_unless
 from sst_ros.mechanism import kinematics
 from sst_ros.mechanism.geometry import (
+    CYCLIC,
     Array,
     Geometry,
     cross,
     dot,
     frozen,
+    norm,
     rotation_matrix,
+    vectors,
 )
 from sst_ros.scene.scene import SceneInput, scene_of
 from sst_ros.state import Explained
 
-RAYS = 400  # from a pose, along which det J2 is looked at
+RAYS = 400  # from a pose, along which det J2 is evaluated
 RAY_POINTS = 64  # of a ray: two changes of sign between two of them are overlooked
 REFINED = 6  # nearest changes of sign that are refined
-SINGULAR = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
+SINGULAR_SHARE = 1e-9  # abs(det J2) over that of the pose at a parallel singularity
 POSES_AT_ONCE = 100  # some 100 MB of polynomials along rays
 NEWTON_STEPS = 60  # most of them; a start beside a solution takes five
-LONGEST_STEP = 0.2  # of v
+LONGEST_STEP = 0.2  # of v: a longer one may lead to another solution
 LAST_STEP = 1e-9  # of v: after it rounding is reached, for convergence is quadratic
 FLAT = 1e-200  # squared gradient below which there is no direction to a solution
+DETERMINANT_DEGREE = 6  # of det J2 along a ray as a polynomial in tau
+SHORT_OF_SERIAL = 1.0 - 1e-9  # share of a ray; at its end det J2 is zero in any case
 
 
 @dataclass(frozen=True, repr=False)
@@ -95,11 +100,11 @@ class NearestSingularities(Explained):
     def __getitem__(self, pose: int) -> NearestSingularity:
         """Return that of one pose."""
         return NearestSingularity(
-            str(self.kind[pose]),
-            int(self.leg[pose]),
-            float(self.distance[pose]),
-            self.axis[pose],
-            self.rotation[pose],
+            kind=str(self.kind[pose]),
+            leg=int(self.leg[pose]),
+            distance=float(self.distance[pose]),
+            axis=self.axis[pose],
+            rotation=self.rotation[pose],
         )
 
     def __iter__(self) -> Iterator[NearestSingularity]:
@@ -107,16 +112,13 @@ class NearestSingularities(Explained):
         return (self[pose] for pose in range(len(self)))
 
     def _facts(self) -> dict[str, object]:
-        distances = self.distance
+        least = float(np.min(self.distance, initial=np.inf))
+        largest = float(np.max(self.distance, initial=0.0))
         return {
             "poses": len(self),
             "nearest one is parallel": int(np.count_nonzero(self.leg < 0)),
-            "least turn of the star to one [rad]": float(
-                np.min(distances, initial=np.inf)
-            ),
-            "largest turn of the star to one [rad]": float(
-                np.max(distances, initial=0.0)
-            ),
+            "least turn of the star to one [rad]": least,
+            "largest turn of the star to one [rad]": largest,
         }
 
 
@@ -188,8 +190,9 @@ def _find_nearest(geometry: Geometry, rotations: Array) -> NearestSingularities:
     )
     for pose, turn in zip(owner[is_singular], parallel[is_singular], strict=True):
         if turn @ turn < v[pose] @ v[pose]:
-            leg[pose], v[pose] = -1, turn
-    length = np.sqrt(dot(v, v))
+            leg[pose] = -1
+            v[pose] = turn
+    length = norm(v)
     is_turned = (length > 0.0)[:, None]
     axis = np.where(is_turned, v, (0.0, 0.0, 1.0))
     axis = axis / np.where(is_turned, length[:, None], 1.0)
@@ -204,11 +207,12 @@ def _turns_to_serial(geometry: Geometry, axes: Array) -> tuple[NDArray[np.intp],
     """Return the leg, and v of the least turn, that bring t_k onto +-w_k."""
     normals = cross(geometry.e, axes)
     cosines = dot(geometry.e, axes)
-    sines = np.sqrt(dot(normals, normals))
+    sines = norm(normals)
     angles = np.arctan2(sines, np.abs(cosines))
     leg = angles.argmin(axis=1)
     pose = np.arange(len(axes))
-    normal = np.copysign(1.0, cosines[pose, leg])[:, None] * normals[pose, leg]
+    sign = np.copysign(1.0, cosines[pose, leg])  # the nearer end of the line of w_k
+    normal = sign[:, None] * normals[pose, leg]
     sine = sines[pose, leg][:, None]
     direction = normal / np.where(sine > 0.0, sine, 1.0)
     return leg, np.tan(0.5 * angles[pose, leg])[:, None] * direction
@@ -224,14 +228,15 @@ class _Changes(NamedTuple):
 def _first_changes(geometry: Geometry, axes: Array, nearest: Array) -> _Changes:
     """Return the nearest changes of sign along rays that end at the turns `nearest`."""
     rays = _even_directions(RAYS)
-    angles = 2.0 * np.arctan(np.sqrt(dot(nearest, nearest)))
-    shares = np.linspace(0.0, 1.0 - 1e-9, RAY_POINTS)
+    angles = 2.0 * np.arctan(norm(nearest))
+    shares = np.linspace(0.0, SHORT_OF_SERIAL, RAY_POINTS)
     tau = np.tan(0.5 * angles[:, None] * shares)
-    powers = tau[:, None, :] ** np.arange(7)[:, None]
+    powers = tau[:, None, :] ** np.arange(DETERMINANT_DEGREE + 1)[:, None]
     polynomials = _det_along(geometry.e, axes, rays)
     values = polynomials @ powers
     is_beyond = values * polynomials[:, :1, :1] <= 0.0
-    first = np.where(is_beyond.any(axis=2), is_beyond.argmax(axis=2), RAY_POINTS)
+    changes = is_beyond.any(axis=2)
+    first = np.where(changes, is_beyond.argmax(axis=2), RAY_POINTS)
     nearest_rays = np.argsort(first, axis=1, kind="stable")[:, :REFINED]
     pose, place = np.nonzero(
         np.take_along_axis(first, nearest_rays, axis=1) < RAY_POINTS
@@ -260,11 +265,12 @@ def _det_along(e: Array, axes: Array, rays: Array) -> Array:
     quadratic = 2.0 * dot(ray, w)[..., None] * ray - w
     rows = [_across(e, coefficient) for coefficient in (constant, linear, quadratic)]
     count = len(axes), len(rays)
-    normals = np.zeros((5, *count, 3))  # of the second and third leg, by degree
+    # cross products of the second and the third leg's rows, by degree from 0 to 4
+    normals = np.zeros((5, *count, 3))
     for i, second in enumerate(rows):
         for j, third in enumerate(rows):
             normals[i + j] += cross(second[:, :, 1], third[:, :, 2])
-    polynomials = np.zeros((*count, 7))
+    polynomials = np.zeros((*count, DETERMINANT_DEGREE + 1))
     for i, first in enumerate(rows):
         for degree, normal in enumerate(normals):
             polynomials[:, :, i + degree] += dot(first[:, :, 0], normal)
@@ -289,18 +295,20 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
     count = len(v)
     turn = v[:, None]
     unit = np.eye(3)
-    square, along = dot(v, v), dot(turn, axes)
+    square = dot(v, v)
+    along = dot(turn, axes)
     turned = (1.0 - square)[:, None, None] * axes - 2.0 * cross(turn, axes)
     rows = _across(e, turned + 2.0 * along[..., None] * turn)
     slopes = []
     for i in range(3):
-        by_turn = axes[:, :, i, None] * turn + along[..., None] * unit[i]
+        component = axes[:, :, i, None]
+        by_turn = component * turn + along[..., None] * unit[i]
         change = by_turn - cross(unit[i], axes) - v[:, i, None, None] * axes
         slopes.append(_across(e, 2.0 * change))
     normals = np.empty(axes.shape)
     gradient = np.zeros((count, 3))
     hessian = np.zeros((count, 3, 3))
-    for k, following, last in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    for k, following, last in CYCLIC:
         normals[:, k] = cross(rows[:, following], rows[:, last])
         for i, j in np.ndindex(3, 3):
             first, second = slopes[i][:, following], slopes[j][:, last]
@@ -310,9 +318,9 @@ def _determinant(e: Array, axes: Array, v: Array) -> _Determinant:
     for i, slope in enumerate(slopes):
         gradient[:, i] = dot(slope, normals).sum(axis=1)
         for j in range(3):
-            curved = axes[:, :, i, None] * unit[j] + axes[:, :, j, None] * unit[i]
-            curved = 2.0 * (curved - float(i == j) * axes)
-            hessian[:, i, j] += dot(_across(e, curved), normals).sum(axis=1)
+            symmetric = axes[:, :, i, None] * unit[j] + axes[:, :, j, None] * unit[i]
+            curvature = _across(e, 2.0 * (symmetric - float(i == j) * axes))
+            hessian[:, i, j] += dot(curvature, normals).sum(axis=1)
     return _Determinant(dot(rows[:, 0], normals[:, 0]), gradient, hessian)
 
 
@@ -328,25 +336,24 @@ def _least_turns(
     for _ in range(NEWTON_STEPS):
         if not len(active):
             break
+        turn = v[active]
         scale = 1.0 / sizes[active]
-        determinant = _determinant(e, axes[active], v[active])
+        determinant = _determinant(e, axes[active], turn)
         gradient = scale[:, None] * determinant.gradient
         square = dot(gradient, gradient)
         is_slope = square > FLAT
-        multiplier = -dot(gradient, v[active]) / np.where(is_slope, square, 1.0)
+        multiplier = -dot(gradient, turn) / np.where(is_slope, square, 1.0)
         curvature = (multiplier * scale)[:, None, None] * determinant.hessian
-        step = _constrained_step(
-            curvature, gradient, v[active], scale * determinant.value, is_slope
-        )
-        length = np.sqrt(dot(step, step))
-        v[active] += (
-            step * np.minimum(1.0, LONGEST_STEP / np.maximum(length, FLAT))[:, None]
-        )
+        value = scale * determinant.value
+        step = _constrained_step(curvature, gradient, turn, value, is_slope)
+        length = norm(step)
+        share = np.minimum(1.0, LONGEST_STEP / np.maximum(length, FLAT))
+        v[active] += step * share[:, None]
         is_last = (length <= LAST_STEP) | ~is_slope
         is_singular[active[is_last & is_slope]] = True
         active = active[~is_last]
     determinant = _determinant(e, axes, v)
-    is_singular &= np.abs(determinant.value) < SINGULAR * sizes
+    is_singular &= np.abs(determinant.value) < SINGULAR_SHARE * sizes
     return v, is_singular
 
 
@@ -367,14 +374,18 @@ def _constrained_step(
     tangent = np.eye(3) - normal
     inside = tangent @ (np.eye(3) + curvature) @ tangent + normal
     is_least = np.linalg.eigvalsh(inside).min(axis=1) > 0.0
+    # Unknown are the three components of the step, then the multiplier.
+    step = slice(0, 3)
+    multiplier = -1
     matrix = np.zeros((len(v), 4, 4))
-    matrix[:, :3, :3] = np.eye(3)
-    matrix[:, :3, :3] += np.where(is_least[:, None, None], curvature, 0.0)
-    matrix[:, 3, :3] = gradient
-    matrix[:, :3, 3] = gradient
-    matrix[~is_slope, 3, 3] = 1.0
+    matrix[:, step, step] = np.eye(3)
+    matrix[:, step, step] += np.where(is_least[:, None, None], curvature, 0.0)
+    matrix[:, multiplier, step] = gradient
+    matrix[:, step, multiplier] = gradient
+    matrix[~is_slope, multiplier, multiplier] = 1.0
     right = np.concatenate([-v, -value[:, None]], axis=1)
-    return np.asarray(np.linalg.solve(matrix, right[:, :, None])[:, :3, 0])
+    unknowns = np.linalg.solve(matrix, right[:, :, None])[..., 0]
+    return np.asarray(unknowns[:, step])
 
 
 def _even_directions(count: int) -> Array:
@@ -383,4 +394,4 @@ def _even_directions(count: int) -> Array:
     z = 1.0 - (2.0 * number + 1.0) / count
     angle = np.pi * (3.0 - np.sqrt(5.0)) * number
     radius = np.sqrt(1.0 - z * z)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    return vectors(radius * np.cos(angle), radius * np.sin(angle), z)

@@ -24,7 +24,14 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics, virtual_work
-from sst_ros.mechanism.geometry import Array, Geometry, cross, frozen, rotation_matrix
+from sst_ros.mechanism.geometry import (
+    CYCLIC,
+    Array,
+    Geometry,
+    cross,
+    frozen,
+    rotation_matrix,
+)
 from sst_ros.mechanism.virtual_work import SINGULAR_MATRIX, Posture
 from sst_ros.state import ZERO
 
@@ -147,8 +154,9 @@ def _motion(
     zero = np.zeros(3)
     x = np.array([1.0, 0.0, 0.0])
     # w in {2k} = [r, t x r, t]: it has no component along r.
-    w_ipl = [zero, np.sum(w * cross(t, r), axis=1), np.sum(w * t, axis=1)]
-    turn = np.stack(w_ipl, axis=1)
+    w_across = np.sum(w * cross(t, r), axis=1)
+    w_along = np.sum(w * t, axis=1)
+    turn = np.stack([zero, w_across, w_along], axis=1)
     # (d/dt)(-r mu_dot) in {B} is -r mu_ddot - gamma_dot mu_dot (w x r); w is constant.
     across = cross(turn, np.broadcast_to(x, turn.shape))
     of_gamma = gamma_ddot[:, None] * turn
@@ -175,7 +183,7 @@ def _motion(
 class OrientationSensitivity(NamedTuple):
     """Derivatives of the orientation, as rotation vectors in {E} [rad].
 
-    Their components come first.
+    The first axis behind the poses has the components of the rotation vector.
     """
 
     gamma: Array  #: by the actuator angles, shape (..., 3, 3)
@@ -210,7 +218,8 @@ def orientation_sensitivity(
     if gamma is None:
         gamma, _, _ = kinematics.inverse(geometry, matrix)
     angles = np.asarray(gamma, dtype=float)
-    v, w = geometry.v, geometry.w
+    v = geometry.v
+    w = geometry.w
     r = kinematics.carriage_directions(geometry, angles)
     t = kinematics.star_axes(geometry, matrix)
     shape = angles.shape[:-1]
@@ -219,16 +228,16 @@ def orientation_sensitivity(
     by_alpha = np.zeros((*shape, 3, 3))
     alpha_12, alpha_23, _ = geometry.alpha
     turns = np.cumsum([0.0, alpha_12, alpha_23])
-    for k in range(3):
-        following = (k + 1) % 3
-        r_k, t_k = r[..., k, :], t[..., k, :]
+    for k, following, _ in CYCLIC:
+        r_k = r[..., k, :]
+        t_k = t[..., k, :]
         sine = np.sin(angles[..., k, None])
         cosine = np.cos(angles[..., k, None])
         by_gamma[..., k, k] = _dot(np.cross(w[k], r_k), t_k)
         for leg in (k, following):
-            for axis in range(3):
+            for axis, direction in enumerate(np.eye(3)):
                 # v stays a unit vector: its change is across itself.
-                moved_v = np.eye(3)[axis] - v[leg] * v[leg][axis]
+                moved_v = direction - v[leg] * v[leg][axis]
                 if leg == k:
                     moved_v_k = moved_v
                     moved_normal = cross(moved_v, v[following])
@@ -240,7 +249,8 @@ def orientation_sensitivity(
                 moved_across = cross(moved_w, v[k]) + cross(w[k], moved_v_k)
                 moved_r = cosine * moved_v_k + sine * moved_across
                 by_v[..., k, leg, axis] = _dot(moved_r, t_k)
-        e_slope = np.array([-np.cos(turns[k]), -np.sin(turns[k]), 0.0])
+        turn = turns[k]
+        e_slope = np.array([-np.cos(turn), -np.sin(turn), 0.0])
         by_turn = _dot(r_k, matrix @ e_slope)
         by_alpha[..., k, :k] = by_turn[..., None]
     j2 = cross(t, r)

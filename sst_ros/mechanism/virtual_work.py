@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from sst_ros.errors import SingularConfiguration
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.geometry import Array, Geometry, cross
+from sst_ros.mechanism.geometry import Array, Geometry, columns, cross
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 
@@ -113,7 +113,19 @@ def posture(
     wr = cross(w, r)
     b = -(wr @ j) / np.sum(wr * t, axis=1)[:, None]
     u = np.diag(np.sum(t * w, axis=1)) - t @ j
-    return Posture(angles, rotation, r, t, w, c, j2, j, a, b, u)
+    return Posture(
+        gamma=angles,
+        rotation=rotation,
+        r=r,
+        t=t,
+        w=w,
+        c=c,
+        j2=j2,
+        j=j,
+        a=a,
+        b=b,
+        u=u,
+    )
 
 
 def bias(posture: Posture, gamma_dot: ArrayLike) -> Bias:
@@ -135,9 +147,10 @@ def bias(posture: Posture, gamma_dot: ArrayLike) -> Bias:
 
 def link_frames(posture: Posture) -> tuple[Array, Array]:
     """Rotations of {1k} and {2k} in {B}, Eqs. 50 to 52, each shape (3, 3, 3)."""
-    first = np.stack([posture.r, cross(posture.w, posture.r), posture.w], axis=2)
-    second = np.stack([posture.r, cross(posture.t, posture.r), posture.t], axis=2)
-    return first, second
+    r = posture.r
+    t = posture.t
+    w = posture.w
+    return columns(r, cross(w, r), w), columns(r, cross(t, r), t)
 
 
 def link_jacobians(posture: Posture) -> tuple[Array, Array]:

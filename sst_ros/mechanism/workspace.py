@@ -13,7 +13,7 @@ when some alpha_k > 180 deg; none for all alpha_k < 180 deg and beta_k < 90 deg.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import product
 
 import numpy as np
@@ -21,13 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, refuse_unless
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen
+from sst_ros.mechanism.geometry import Array, Geometry, columns, cross, frozen, vectors
 from sst_ros.progress import slices
 from sst_ros.state import Explained
 
-BLOCK = 20_000  # poses that are measured at a time
+MEASURED_AT_ONCE = 20_000  # poses that are measured at a time
 BISECTIONS = 55  # of psi between two samples: to rounding
-MOST_POSES = 20_000_000  # of a map: 4 GB
+MOST_MAP_POSES = 20_000_000  # of a map: 4 GB
 SMOOTH = 1.0  # change of gamma [rad] between two samples that is no jump by pi
 
 
@@ -95,7 +95,8 @@ class OrientationMap:
             crossing = np.where(outer < 0.0, inner / (inner - outer), 0.5)
         share = np.where(first | second, crossing, 0.0)
         share = np.where(first & second, 1.0, share)
-        return np.asarray(share.sum(axis=1) * (2.0 * np.pi / len(self.psi)))
+        step = 2.0 * np.pi / len(self.psi)
+        return np.asarray(share.sum(axis=1) * step)
 
     @property
     def best_cond_j(self) -> Array:
@@ -153,7 +154,8 @@ def _condition(normal: Array, c: Array) -> Array:
     ]
     matrix = np.nan_to_num(np.stack(rows, axis=-2))
     singular = np.linalg.svd(matrix, compute_uv=False)
-    largest, smallest = singular[..., 0], singular[..., -1]
+    largest = singular[..., 0]
+    smallest = singular[..., -1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(smallest > 0.0, largest / smallest, np.inf))
 
@@ -169,8 +171,8 @@ def workspace(
     a full turn. InputError refuses less than 1 of them. With `progress` a bar is drawn
     on a terminal.
     """
-    is_small = int(divisions) ** 2 * int(turns) // 2 <= MOST_POSES
-    requirement = f"must be at least 1, and make no more than {MOST_POSES:g} poses"
+    is_small = int(divisions) ** 2 * int(turns) // 2 <= MOST_MAP_POSES
+    requirement = f"must be at least 1, and make no more than {MOST_MAP_POSES:g} poses"
     refuse_unless(
         "workspace",
         ("divisions", divisions, divisions >= 1 and is_small, requirement),
@@ -192,13 +194,16 @@ def over_orientations(
     step = 2.0 * np.pi / turns
     psi = np.asarray((np.arange(turns) + 0.5) * step - np.pi, dtype=float)
     measured = []
-    size = max(1, BLOCK // turns)
+    size = max(1, MEASURED_AT_ONCE // turns)
     for block in slices(len(directions), size, "orientations", progress):
         rotation = orientations(directions[block][:, None], psi)
         gamma, _, _ = kinematics.inverse(geometry, rotation)
         measured.append(measures(geometry, gamma, rotation))
-    by_name = zip(*(vars(part).values() for part in measured), strict=True)
-    joined = Measures(*map(np.concatenate, by_name))
+    arrays = {}
+    for field in fields(Measures):
+        blocks = [getattr(block_measures, field.name) for block_measures in measured]
+        arrays[field.name] = np.concatenate(blocks)
+    joined = Measures(**arrays)
     frozen(directions, psi, *vars(joined).values())
     return OrientationMap(geometry, directions, psi, joined)
 
@@ -209,14 +214,14 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
     theta and phi are those of s; where s = +-z, theta is 0. R has the shape (..., 3,
     3).
     """
-    s_x, s_y, s_z = s[..., 0], s[..., 1], s[..., 2]
+    s_x, s_y, s_z = np.moveaxis(s, -1, 0)
     sine_phi = np.hypot(s_x, s_y)
     at_pole = sine_phi == 0.0
     divisor = np.where(at_pole, 1.0, sine_phi)
     cosine = np.where(at_pole, 1.0, s_x / divisor)  # of theta
     sine = np.where(at_pole, 0.0, s_y / divisor)
-    along = np.stack([cosine * s_z, sine * s_z, -sine_phi], axis=-1)
-    across = np.stack([-sine, cosine, np.zeros_like(sine)], axis=-1)
+    along = vectors(cosine * s_z, sine * s_z, -sine_phi)
+    across = vectors(-sine, cosine, np.zeros_like(sine))
     angle = np.asarray(psi, dtype=float)[..., None]
     x = np.cos(angle) * along + np.sin(angle) * across
     y = np.cos(angle) * across - np.sin(angle) * along
@@ -226,20 +231,27 @@ def orientations(s: Array, psi: ArrayLike) -> Array:
 def triangle_directions(
     geometry: Geometry, divisions: int = 40
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Directions inside the base triangle, (m, 3), and their triangles, (n, 3)."""
+    """Return directions inside the base triangle, (m, 3), and their triangles, (n, 3).
+
+    The directions are the nodes (i, j) of a triangular grid, i steps from one corner
+    and j from another; each triangle has the numbers of its three nodes.
+    """
     steps = range(divisions + 1)
     i, j = np.nonzero(np.add.outer(steps, steps) <= divisions)
-    number = np.full((divisions + 2, divisions + 2), -1)  # -1 for none
+    no_node = -1
+    number = np.full((divisions + 2, divisions + 2), no_node)
     number[i, j] = np.arange(len(i))
-    corner, right, above = number[i, j], number[i + 1, j], number[i, j + 1]
-    below = np.where(j > 0, number[i + 1, j - 1], -1)
-    upward = corner, right, above
-    downward = corner, below, right
+    corner = number[i, j]
+    right = number[i + 1, j]
+    above = number[i, j + 1]
+    below = np.where(j > 0, number[i + 1, j - 1], no_node)
+    upward = (corner, right, above)
+    downward = (corner, below, right)
     faces = np.stack([upward, downward], axis=-1).reshape(3, -1).T
     # 0.1 of a step more for each corner keeps all directions off the edges.
     weights = np.column_stack([i, j, divisions - i - j]) + 0.1
     s = weights @ geometry.v
-    inside = np.asarray(faces[faces.min(axis=1) >= 0], dtype=np.intp)
+    inside = np.asarray(faces[faces.min(axis=1) > no_node], dtype=np.intp)
     return s / np.linalg.norm(s, axis=1)[:, None], inside
 
 
@@ -254,7 +266,7 @@ class SingularPoses:
     beta: Array
     #: index k of the singular leg, shape (m,); -1 for parallel ones, which involve all
     leg: Array
-    determinant: Array  #: det J2 or c_k that was found, shape (m,): 0 up to rounding
+    determinant: Array  #: det J2 or c_k there, shape (m,): 0 up to rounding
 
     def __len__(self) -> int:
         return len(self.rotation)
@@ -304,12 +316,14 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
     rows = []
     z = np.array([0.0, 0.0, 1.0])
     for k, sign in product(range(3), (1.0, -1.0)):
-        angles = np.linspace(0.0, geometry.arc[k], points)
-        s = np.cos(angles)[:, None] * geometry.v[k]
-        s = s + np.sin(angles)[:, None] * cross(geometry.w[k], geometry.v[k])
-        t = np.broadcast_to(sign * geometry.w[k], s.shape)
-        # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
+        v = geometry.v[k]
+        w = geometry.w[k]
         e = geometry.e[k]
+        angles = np.linspace(0.0, geometry.arc[k], points)
+        s = np.cos(angles)[:, None] * v
+        s = s + np.sin(angles)[:, None] * cross(w, v)
+        t = np.broadcast_to(sign * w, s.shape)
+        # R maps e_k to t_k and z to s; in {E} the triad is (e_k x z, e_k, z).
         triad = np.stack([np.cross(e, z), e, z])
         rotation = columns(cross(t, s), t, s) @ triad
         gamma, _, beta = kinematics.inverse(geometry, rotation)
@@ -317,14 +331,14 @@ def serial_singularities(geometry: Geometry, points: int = 90) -> SingularPoses:
         in_reach = (beta > 0.0) & (beta <= geometry.beta_max)
         in_stroke = (gamma >= 0.0) & (gamma <= geometry.arc)
         is_inside = on_triangle & in_reach & in_stroke
-        is_inside[:, k] = True
+        is_inside[:, k] = True  # of the singular leg nothing is asked
         gamma[:, k] = np.nan
         beta[:, k] = np.nan
-        c = np.linalg.norm(cross(t, np.broadcast_to(geometry.w[k], t.shape)), axis=1)
-        kept = is_inside.all(axis=1)
+        c = np.linalg.norm(cross(t, np.broadcast_to(w, t.shape)), axis=1)
         leg = np.full(points, k)
-        rows.append((rotation[kept], gamma[kept], beta[kept], leg[kept], c[kept]))
-    arrays = [np.concatenate(column) for column in zip(*rows, strict=True)]
+        is_kept = is_inside.all(axis=1)
+        rows.append([array[is_kept] for array in (rotation, gamma, beta, leg, c)])
+    arrays = [np.concatenate(blocks) for blocks in zip(*rows, strict=True)]
     return SingularPoses("serial", *frozen(*arrays))
 
 
@@ -341,7 +355,8 @@ def _report_poses(poses: SingularPoses, place: str) -> str:
         return f"{poses.kind}: none {place}"
     row = len(poses) // 2
     gamma = ", ".join(f"{x:.4f}" for x in np.degrees(poses.gamma[row]))
-    s = ", ".join(f"{x:.4f}" for x in poses.rotation[row, :, 2])
+    _, _, s_axis = poses.rotation[row].T
+    s = ", ".join(f"{x:.4f}" for x in s_axis)
     text = f"{len(poses)} found; for example s = ({s}), gamma = ({gamma}) deg"
     if poses.kind == "serial":
         text += f", leg {poses.leg[row] + 1}"

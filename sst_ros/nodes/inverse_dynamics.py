@@ -12,7 +12,7 @@ import concurrent.futures
 import contextlib
 import time
 from array import array
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.action.server import CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -26,13 +26,14 @@ from sst_ros.control.controller import Measurement, TrackingMetrics
 from sst_ros.control.law import Command
 from sst_ros.errors import SstError
 from sst_ros.nodes import topics
-from sst_ros.nodes.process import AnsweringWorker, every
+from sst_ros.nodes.answering import AnsweringWorker
+from sst_ros.nodes.process import every
 from sst_ros.report.results import render
 from sst_ros.runtime.settings import ControllerNodeParameters
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.runtime.trajectory_following import Order, Stage, TrajectoryFollower
 from sst_ros.runtime.trajectory_messages import ErrorCode, TrajectoryGoal
 from sst_ros.scene import scene
+from sst_ros.scene.loads import ACTUATED_JOINTS
 from sst_ros.state import NANOSECONDS, Vector3, nanoseconds
 
 FOLLOWER_KEYS = {
@@ -50,11 +51,21 @@ FOLLOWER_KEYS = {
     "last_refusal": "reason of the last refusal",
 }
 """Keys of the controller's /diagnostics, in order."""
-_FEEDBACK_PERIOD_S = 0.05
+_FEEDBACK_PERIOD_S = 0.05  # of a goal: more than an operator sees
 _STREAM_LOG_PERIOD_S = 1.0  # trajectories of a stream are not logged more often
 _SPINS_AT_END = 20
 """Spins to deliver the result of a goal that the end of the node aborts: 0.2 s."""
 _SPIN_S = 0.01
+
+
+class _Feedback(NamedTuple):
+    """What is reported of a goal at a sample."""
+
+    stamp: Any  # of the sample
+    point_index: int  # of the point that is approached
+    time: float  # of the trajectory [s]
+    measured: Measurement
+    command: Command
 
 
 class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
@@ -64,13 +75,13 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
     """
 
     def __init__(self) -> None:
-        super().__init__("sst_inverse_dynamics", ControllerNodeParameters)
-        parameters = self.parameters
         own = topics.CONTROLLER
+        super().__init__("sst_inverse_dynamics", ControllerNodeParameters, own)
+        parameters = self.parameters
         self.follower = TrajectoryFollower(scene.load(parameters.scene), parameters)
-        names = ("reference", "tracking_error", "diagnostics")
-        publishers = (own[name].publisher(self.node) for name in names)
-        self._reference, self._error, self._diagnostics = publishers
+        self._reference = own["reference"].publisher(self.node)
+        self._error = own["tracking_error"].publisher(self.node)
+        self._diagnostics = own["diagnostics"].publisher(self.node)
         self._measured: Measurement | None = None
         self._measured_ns = 0
         self._refused = 0
@@ -81,9 +92,9 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         self._goal: tuple[TrajectoryGoal, Order] | None = None
         # Loads the template now: later that would delay the control.
         render("tracking.txt", found=TrackingMetrics())
-        self._feedback: Any = None
+        self._feedback: _Feedback | None = None
         self._action_type: Any = None  # FollowJointTrajectory, where that is installed
-        self.connect(own, joint_trajectory=self._replace)
+        self.connect(joint_trajectory=self._replace)
         every(self.node, 1.0, self._report)
         action = own["follow_joint_trajectory"]
         types = topics.optional_types(self.node, [action.type_name])
@@ -189,16 +200,14 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             self.done.set()
 
     def _publish(self, state: JointState, command: Command) -> None:
+        """Publish what is desired of a sample, and by how much it is missed."""
         desired = command.desired
-        for publisher, *numbers in (
-            (self._reference, desired.gamma, desired.gamma_dot, command.feedforward),
-            (self._error, command.error, command.error_rate, command.feedback),
-        ):
-            position, velocity, effort = (array("d", triple) for triple in numbers)
-            message = JointState(position=position, velocity=velocity, effort=effort)
-            message.header.stamp = state.header.stamp
-            message.name = list(ACTUATED_JOINTS)
-            publisher.publish(message)
+        reference = _joint_state(desired.gamma, desired.gamma_dot, command.feedforward)
+        error = _joint_state(command.error, command.error_rate, command.feedback)
+        reference.header.stamp = state.header.stamp
+        error.header.stamp = state.header.stamp
+        self._reference.publish(reference)
+        self._error.publish(error)
 
     def _replace(self, trajectory: JointTrajectory) -> None:
         """Follow a trajectory of the topic, and no goal any more."""
@@ -207,7 +216,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             if self._is_accepted(outcome):
                 self._interrupt("replaced by a trajectory of ~/joint_trajectory")
 
-        if (order := self._take(trajectory)) is not None:
+        order = self._take(trajectory)
+        if order is not None:
             order.outcome.add_done_callback(settle)
 
     def _take(self, trajectory: JointTrajectory) -> Order | None:
@@ -231,7 +241,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         """
         if outcome.cancelled():
             return False
-        if (error := outcome.exception()) is not None:
+        error = outcome.exception()
+        if error is not None:
             self._refuse(error)
             return False
         self.node.get_logger().info(
@@ -252,32 +263,36 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         super().watch()
 
     def _report(self) -> None:
+        """Publish diagnostics: the keys are those of FOLLOWER_KEYS, in their order."""
         follower = self.follower
-        stage = (
-            "waiting for joint_states"
-            if self._measured is None
-            else follower.stage.value
-        )
-        counts = (
-            follower.samples,
-            follower.irregular,
-            follower.limited,
-            self.foreign_states,
-        )
-        refusals = self._refused, self._last_refusal
-        row = (stage, self.parameters.mode, *counts, *follower.errors, *refusals)
-        doubts = {
-            "samples do not come at rate": follower.irregular,
-            "torques are limited": follower.limited,
-            "a trajectory was refused": self._refused,
+        stage = follower.stage.value
+        if self._measured is None:
+            stage = "waiting for joint_states"
+        error_rms, error_max = follower.errors
+        values = {
+            "stage": stage,
+            "mode": self.parameters.mode,
+            "samples": follower.samples,
+            "samples_irregular": follower.irregular,
+            "samples_limited": follower.limited,
+            "foreign_states": self.foreign_states,
+            "error_rms_rad": error_rms,
+            "error_max_rad": error_max,
+            "trajectories_refused": self._refused,
+            "last_refusal": self._last_refusal,
         }
-        statements = [stage, *(text for text, count in doubts.items() if count)]
-        values = dict(zip(FOLLOWER_KEYS, row, strict=True))
-        level = int(len(statements) > 1)
-        message = topics.diagnostics(
-            self.node, "control", level, "; ".join(statements), values
+        doubts: list[str] = []
+        if follower.irregular:
+            doubts.append("samples do not come at rate")
+        if follower.limited:
+            doubts.append("torques are limited")
+        if self._refused:
+            doubts.append("a trajectory was refused")
+        text = "; ".join([stage, *doubts])
+        level = 1 if doubts else 0
+        self._diagnostics.publish(
+            topics.diagnostics(self.node, "control", level, text, values)
         )
-        self._diagnostics.publish(message)
 
     def _judge(
         self, state: JointState, measured: Measurement, command: Command
@@ -289,13 +304,17 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         if order is not self.follower.order:  # the motion before it is followed still
             return
         time = self.follower.time + order.passed
-        self._feedback = state.header.stamp, goal.index(time), time, measured, command
+        point_index = goal.index(time)
+        self._feedback = _Feedback(
+            state.header.stamp, point_index, time, measured, command
+        )
         outcome = goal.outcome(time, command.error, command.error_rate)
         if outcome is None:
             return
         self._report_goal()
-        self._end(*outcome)
-        if outcome[0] is not ErrorCode.SUCCESSFUL:
+        code, reason = outcome
+        self._end(code, reason)
+        if code is not ErrorCode.SUCCESSFUL:
             self.follower.stop()
 
     def _interrupt(self, reason: str) -> None:
@@ -309,7 +328,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         except SstError as error:
             self._refuse(error)
             return GoalResponse.REJECT
-        if (order := self._take(request.trajectory)) is None:
+        order = self._take(request.trajectory)
+        if order is None:
             return GoalResponse.REJECT
         checked: Future[None] = Future()
         order.outcome.add_done_callback(lambda _: checked.set_result(None))
@@ -317,12 +337,17 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         if not self._is_accepted(order.outcome):
             return GoalResponse.REJECT
         self._interrupt("preempted by a new goal")
-        self._goal = goal, order
+        self._goal = (goal, order)
         return GoalResponse.ACCEPT
 
     def _begin(self, handle: Any) -> None:
-        self._active, self._feedback = topics.ActionGoal(handle), None
-        if self._goal is not None and not self.follower.has(self._goal[1]):
+        """Follow an accepted goal, unless its trajectory has been replaced since."""
+        self._active = topics.ActionGoal(handle)
+        self._feedback = None
+        if self._goal is None:
+            return
+        _, order = self._goal
+        if not self.follower.has(order):
             self._interrupt("replaced by a newer trajectory")
 
     def _cancel(self, handle: Any) -> CancelResponse:
@@ -338,7 +363,8 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         return self._active is not None
 
     def _end(self, code: ErrorCode, message: str) -> None:
-        active, self._active = self._active, None
+        active = self._active
+        self._active = None
         assert active is not None
         self.node.get_logger().info(f"follow_joint_trajectory: {message}")
         result = self._action_type.Result(error_code=int(code), error_string=message)
@@ -348,10 +374,12 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
         """Publish feedback of the last sample, once."""
         if not self._is_active() or self._feedback is None or self._active is None:
             return
-        (stamp, index, time, measured, command), self._feedback = self._feedback, None
+        stamp, index, time, measured, command = self._feedback
+        self._feedback = None
         desired = command.desired
         message = self._action_type.Feedback(joint_names=list(ACTUATED_JOINTS))
-        message.header.stamp, message.index = stamp, index
+        message.header.stamp = stamp
+        message.index = index
         message.desired = _point(
             time, desired.gamma, desired.gamma_dot, command.feedforward
         )
@@ -371,8 +399,21 @@ def _measure(state: JointState) -> Measurement:
     if not len(names) == len(state.position) == len(state.velocity):
         raise SstError("joint_states must have a position and a velocity for each name")
     i, j, k = map(names.index, ACTUATED_JOINTS)
-    p, v = state.position, state.velocity
-    return Measurement((p[i], p[j], p[k]), (v[i], v[j], v[k]))
+    angles = state.position
+    rates = state.velocity
+    return Measurement(
+        (angles[i], angles[j], angles[k]), (rates[i], rates[j], rates[k])
+    )
+
+
+def _joint_state(angles: Vector3, rates: Vector3, torques: Vector3) -> JointState:
+    """Make a message of numbers of the actuators [rad], [rad/s], [N m]."""
+    return JointState(
+        name=list(ACTUATED_JOINTS),
+        position=array("d", angles),
+        velocity=array("d", rates),
+        effort=array("d", torques),
+    )
 
 
 def _print(tracking: TrackingMetrics | None) -> None:
@@ -383,8 +424,10 @@ def _print(tracking: TrackingMetrics | None) -> None:
 def _point(
     time: float, angles: Vector3, rates: Vector3, torques: Vector3
 ) -> JointTrajectoryPoint:
+    """Make a point of a trajectory at a time [s] of numbers of the actuators."""
     point = JointTrajectoryPoint()
-    point.positions, point.velocities = array("d", angles), array("d", rates)
+    point.positions = array("d", angles)
+    point.velocities = array("d", rates)
     point.effort = array("d", torques)
     point.time_from_start = Duration(nanoseconds=round(time * NANOSECONDS)).to_msg()
     return point

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One process, one node: its parameters, start, callbacks, and an orderly end."""
+"""One process, one node: its parameters, start, callbacks, and an orderly end.
+
+`run` reads the command line, starts the worker of the node and lets it `spin` until it
+is done, is asked to end or fails.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,6 @@ from typing import Any, Generic, TypeAlias, TypeVar
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import SetParametersResult as Result
-from rcl_interfaces.srv import GetParameters
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -31,16 +34,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.timer import Timer
-from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 
 from sst_ros.errors import Check, InputError, SstError, refuse_unless
-from sst_ros.nodes import signals, topics
+from sst_ros.nodes import signals
 from sst_ros.runtime import arguments, settings
 from sst_ros.runtime.child_process import is_orphan
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.schema import Spec
-from sst_ros.state import ZERO, Vector3, is_idle, nanoseconds
 
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 _PROFILES = {
@@ -52,23 +51,24 @@ _PROFILES = {
 The first is for Fast DDS 2, libfastrtps, the second for Fast DDS 3, libfastdds.
 """
 _ORPHAN_POLL_S = 0.1
-"""Longest delay of a signal.
+"""Period of looks for a signal and for the end of the parent.
 
 The executor would take half a millisecond for each look.
 """
 _CALLBACK_S = 1.0
-"""Wait for a callback in progress.
+"""Longest wait for a callback in progress.
 
 A service that waits for the run ends once that is closed.
 """
 _ACKNOWLEDGE_AT_END_S = 6.0
 """Longest wait for subscribers of a node whose work is done, within _CLEAN_UP_S."""
 _ACKNOWLEDGE_S = 1.2
-"""A killed subscriber never acknowledges: a node ends within 2 s of a signal."""
-_CLEAN_UP_S = 10.0  # longer than any clean-up of the middleware, also on a busy machine
-_WATCH_S = 0.25
-_LOG_PERIOD_S = 5.0  # of what a node waits for
-_STDERR = 2
+"""The same after a signal: a killed subscriber never acknowledges, and a node ends
+within 2 s of a signal.
+"""
+_CLEAN_UP_S = 10.0
+"""Longer than any clean-up of the middleware takes, also on a busy machine."""
+_STDERR = 2  # its descriptor
 
 _PARAMETER_TYPES = {
     "number": Parameter.Type.DOUBLE,
@@ -80,11 +80,11 @@ _PARAMETER_TYPES = {
 }
 _LISTS = (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.STRING_ARRAY)
 _WIDEST_RANGE = 1e300
+"""Ends of a range in a descriptor are finite."""
 
 Defaults: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 """Defaults of some parameters, by the values that others are given."""
 P = TypeVar("P", bound=settings.NodeParameters)
-A = TypeVar("A", bound=settings.AnsweringParameters)
 
 
 class Worker(Generic[P]):
@@ -151,15 +151,16 @@ def _plain_value(spec: Spec, value: Any) -> Any:
 
 
 def _declare(node: Node, cls: type[P], dependent_defaults: Defaults) -> P:
+    """Declare the parameters of a node and return their values, checked."""
     # rclpy has no public call for the values that were given; Jazzy and Kilted have
     # this.
     overrides: dict[str, Any] = {
         name: parameter.value for name, parameter in node._parameter_overrides.items()
     }
     defaults = {**vars(cls()), **dependent_defaults(overrides)}
-    values = dict[str, Any]()
+    values: dict[str, Any] = {}
     origin = node.get_fully_qualified_name()
-    checks = list[Check]()
+    checks: list[Check] = []
     for name, spec in cls.SPECS.items():
         value = _plain_value(spec, overrides.get(name, defaults[name]))
         values[name] = value
@@ -232,192 +233,6 @@ def _descriptor(name: str, spec: Spec, *, read_only: bool) -> ParameterDescripto
     return descriptor
 
 
-class AnsweringWorker(Worker[A]):
-    """A node that answers the joint states of a simulator with torques.
-
-    The phase and the joint states are two topics, whose messages come in any order.
-
-    Attributes:
-        begun: a sample of the run has been answered.
-        commanded: a torque has been sent, or was about to be: the simulator is this
-            node's concern.
-        phase: what the simulator said last of its run; empty before.
-        heard_s: monotonic time of the last joint states of this robot [s].
-        foreign_states: messages on joint_states of other robots, which are ignored.
-
-    """
-
-    def connect(
-        self, own: dict[str, topics.Endpoint], **callbacks: Callable[[Any], None]
-    ) -> None:
-        """Publish commands, and listen to topics of its own table.
-
-        Call this as soon as the node can answer.
-        """
-        parameters = self.parameters
-        self._own = own
-        self.begun = self.commanded = False
-        self.phase = ""
-        self.heard_s = time.monotonic()
-        self.foreign_states = 0
-        # One message for all commands, whose torques are set in place.
-        torques = array("d", ZERO)
-        if parameters.stamped:
-            topic = own["commands_stamped"]
-            self._message: Any = topic.kind(name=list(ACTUATED_JOINTS), effort=torques)
-            self._torques = self._message.effort
-        else:
-            topic = own["commands"]
-            self._message = topic.kind(data=torques)
-            self._torques = self._message.data
-        self._commands = topic.publisher(self.node, simulator=parameters.simulator)
-        handlers = {"phase": self.hear, "joint_states": self.receive, **callbacks}
-        topics.subscribe(self.node, own, parameters.simulator, **handlers)
-        self._simulator: Any = None
-        if not parameters.stamped:
-            service = own["get_parameters"]
-            name = service.name.format(simulator=parameters.simulator)
-            self._simulator = self.node.create_client(service.kind, name)
-        self._sync: Any = None  # the future of the simulator's parameter
-        every(self.node, _WATCH_S, self.watch)
-
-    def close(self) -> None:
-        """Leave the actuators without torque where the work is not done."""
-        if self.commanded and not self.done.is_set():
-            self._publish_torque(ZERO)
-
-    def answer(self, state: JointState, stamp_ns: int) -> None:
-        """Answer a sample of the run by `send`."""
-        raise NotImplementedError
-
-    def preview(self) -> Vector3 | None:
-        """Return what answers a state before the run [N m], if anything does."""
-        raise NotImplementedError
-
-    def may_begin(self) -> bool:
-        """Whether all have subscribed who are to receive the whole run."""
-        return not self.missing_subscribers()
-
-    def missing_subscribers(self) -> list[str]:
-        """Return the topics with too few subscribers, with counts.
-
-        The parameters say how many are needed.
-        """
-        count = self._commands.get_subscription_count()
-        least = self.parameters.min_subscribers
-        if count >= least:
-            return []
-        return [f"{self._commands.topic_name} has {count} of {least}"]
-
-    def hear(self, phase: String) -> None:
-        """Remember the phase; end with a simulator that stops by a fault.
-
-        Raises:
-            SstError: the simulator, which this node has commanded, is in a fault.
-
-        """
-        self.phase = phase.data
-        self._end_at_fault()
-
-    def receive(self, state: JointState) -> None:
-        """Have a state of this robot answered: one of the run, or shown before it.
-
-        Raises:
-            SstError: some actuators are missing, or the simulator is in a fault.
-
-        """
-        absent = [name for name in ACTUATED_JOINTS if name not in state.name]
-        if len(absent) == len(ACTUATED_JOINTS):
-            self._ignore(state)
-            return
-        if absent:
-            names = list(state.name)
-            raise SstError(
-                f"joint_states has no {', '.join(absent)}: its names are {names}"
-            )
-        self.heard_s = time.monotonic()
-        self.see(state)
-        # Once begun, the simulator may end before its last sample has arrived.
-        if not (self.begun or self.may_begin()):
-            return
-        if self.parameters.stamped:
-            self._message.header.stamp = state.header.stamp
-        stamp_ns = nanoseconds(state.header.stamp)
-        if not is_idle(stamp_ns, state.header.frame_id):
-            self.answer(state, stamp_ns)
-        elif not self.begun and (torque := self.preview()) is not None:
-            self.send(torque)
-
-    def see(self, state: JointState) -> None:
-        """Look at a state of this robot before it is answered, or where it is not."""
-
-    def send(self, torque: Vector3) -> None:
-        """Publish torques [N m], with the stamp of the state that they answer.
-
-        Raises:
-            SstError: the simulator is in a fault.
-
-        """
-        self.commanded = True
-        self._end_at_fault()
-        self._publish_torque(torque)
-
-    def watch(self) -> None:
-        """End with the run.
-
-        Raise SstError after a long silence, or where no answer is taken.
-        """
-        if self.commanded and self.phase == "finished":
-            self.done.set()
-            return
-        if self._sync is None:
-            if self._simulator is not None and self._simulator.service_is_ready():
-                self._sync = self._simulator.call_async(
-                    GetParameters.Request(names=["sync"])
-                )
-        elif self._sync.done():
-            values = self._sync.result().values
-            if values and values[0].string_value == "lockstep":
-                text = (
-                    "the simulator runs in lockstep and takes no command without a"
-                    " stamp"
-                )
-                raise SstError(f"stamped = false: {text}: give stamped:=true")
-        silent = time.monotonic() - self.heard_s
-        if silent > self.parameters.timeout:
-            reason = "is the simulator running?"
-            if self.foreign_states:
-                named = ", ".join(ACTUATED_JOINTS)
-                reason = f"{self.foreign_states} messages without {named} were ignored"
-            robots = topics.other_types(self.node, self._own["joint_states"])
-            reasons = "; ".join([reason, *robots])
-            raise SstError(f"no joint_states for {silent:.1f} s: {reasons}")
-        if not self.commanded and silent < _WATCH_S and not self.may_begin():
-            self.node.get_logger().info(
-                f"waiting for subscribers: {', '.join(self.missing_subscribers())}",
-                throttle_duration_sec=_LOG_PERIOD_S,
-                skip_first=True,
-            )
-
-    def _end_at_fault(self) -> None:
-        if self.commanded and self.phase.startswith("fault"):
-            raise SstError(f"the simulator stopped: {self.phase}")
-
-    def _ignore(self, state: JointState) -> None:
-        """Count a message of another robot; say so the first time."""
-        if self.foreign_states == 0:
-            self.node.get_logger().warning(
-                f"joint_states without {', '.join(ACTUATED_JOINTS)} are ignored:"
-                " another robot publishes there, too"
-                f" (its names are {list(state.name)})"
-            )
-        self.foreign_states += 1
-
-    def _publish_torque(self, torque: Vector3) -> None:
-        self._torques[0], self._torques[1], self._torques[2] = torque
-        self._commands.publish(self._message)
-
-
 def run(command_line: Sequence[str]) -> int:
     """Run a node until a signal of `signals`, its end or the end of its parent.
 
@@ -472,10 +287,9 @@ def _run(command_line: Sequence[str]) -> int:
             spin(worker)
     except (SstError, ParameterException) as error:
         text = str(error)
-        print(
-            text if text.startswith(f"{command}: ") else f"{command}: {text}",
-            file=sys.stderr,
-        )
+        if not text.startswith(f"{command}: "):
+            text = f"{command}: {text}"
+        print(text, file=sys.stderr)
         return 1
     finally:
         with _bound_time():
@@ -508,7 +322,7 @@ def spin(worker: Worker[Any]) -> None:
     """
     node = worker.node
     ends = threading.Event()
-    errors = list[BaseException]()
+    errors: list[BaseException] = []
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     wake = node.create_guard_condition(lambda: None)
@@ -591,10 +405,10 @@ def configure_middleware() -> None:
 
 def _has_library(name: str) -> bool:
     """Look for a shared library where the loader finds that of the middleware."""
-    folders = os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
-    return any(
-        next(Path(folder).glob(f"lib{name}.so*"), None) for folder in folders if folder
-    )
+    for folder in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep):
+        if folder and any(Path(folder).glob(f"lib{name}.so*")):
+            return True
+    return False
 
 
 def every(node: Node, seconds: float, callback: Callable[[], None]) -> Timer:

@@ -40,8 +40,7 @@ from sst_ros.nodes.sensors import (
     StateMessages,
 )
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS
-from sst_ros.scene.loads import JOINTS, MOMENTS
+from sst_ros.scene.loads import ACTUATED_JOINTS, JOINTS, MOMENTS, PASSIVE_JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.yaml_document import dump
 from sst_ros.simulation.simulation import Simulation
@@ -54,7 +53,7 @@ _FAST = 10  # real-time factor that the history of a run without deadlines is ma
 _LEAST_DEPTH = 10
 _MOST_DEPTH = 20_000
 _AT_REST = (0.0,) * len(JOINTS)
-_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATED_JOINTS))
+_PASSIVE = (0.0,) * len(PASSIVE_JOINTS)
 _SENSORS = ("imu", "reaction")
 """Topics of samples only, for which the acceleration of the star is computed."""
 
@@ -129,15 +128,18 @@ def zyz_angles(quaternion: Sequence[float]) -> tuple[float, float, float]:
     tan((theta - psi) / 2).
     """
     x, y, z, w = quaternion
-    sine, cosine = math.hypot(x, y), math.hypot(z, w)
-    total = math.atan2(z, w) if cosine else 0.0
-    difference = math.atan2(-x, y) if sine else 0.0
-    if sine and cosine:
-        theta, psi = total + difference, total - difference
-    else:
-        theta, psi = 0.0, 2.0 * (total - difference)
-    theta, psi = (math.remainder(angle, 2.0 * math.pi) for angle in (theta, psi))
-    return theta, 2.0 * math.atan2(sine, cosine), psi
+    sine = math.hypot(x, y)  # of phi / 2
+    cosine = math.hypot(z, w)
+    half_sum = math.atan2(z, w) if cosine else 0.0  # (theta + psi) / 2
+    half_difference = math.atan2(-x, y) if sine else 0.0  # (theta - psi) / 2
+    theta = half_sum + half_difference
+    psi = half_sum - half_difference
+    if not (sine and cosine):  # only one of the two is determined
+        theta = 0.0
+        psi = 2.0 * (half_sum - half_difference)
+    full_turn = 2.0 * math.pi
+    phi = 2.0 * math.atan2(sine, cosine)
+    return math.remainder(theta, full_turn), phi, math.remainder(psi, full_turn)
 
 
 class TorqueLog:
@@ -208,9 +210,9 @@ def sensor_messages(scene: Scene, settings: SimulatorParameters) -> StateMessage
         joint, _, number = settings.reaction.partition("_")
         leg = int(number) - 1
         link = ACTUATED_LINKS[leg] if joint == "actuated" else INTERMEDIATE[leg]
-        prefix = settings.base_frame.removesuffix(BASE_FRAME)
-        if prefix == settings.base_frame:
-            prefix = ""
+        prefix = ""  # that robot_state_publisher puts before all frames
+        if settings.base_frame.endswith(BASE_FRAME):
+            prefix = settings.base_frame.removesuffix(BASE_FRAME)
         wrench = reaction_at(scene, joint, leg)
         messages["reaction"] = ReactionMessage(prefix + link, wrench)
     return messages
@@ -339,11 +341,13 @@ class SimulatorTopics:
 
     def _numbers_of(self, simulation: Simulation) -> Numbers:
         motion, joints, torque = simulation.sample
-        quaternion = (motion[0], motion[1], motion[2], motion[3])
-        numbers = Numbers(quaternion, joints[:9], joints[9:], torque)
+        x, y, z, w, rate_x, rate_y, rate_z, *_ = motion
+        angles = joints[: len(JOINTS)]
+        rates = joints[len(JOINTS) :]
+        numbers = Numbers((x, y, z, w), angles, rates, torque)
         if any(sensor in self._read for sensor in _SENSORS):
             numbers = numbers._replace(
-                body_rate=(motion[4], motion[5], motion[6]),
+                body_rate=(rate_x, rate_y, rate_z),
                 body_acceleration=simulation.body_acceleration,
             )
         return numbers

@@ -2,9 +2,8 @@
 """The recorder: topics into a rosbag2 in MCAP, without a ROS installation.
 
 Messages are never decoded: the serialized bytes go from DDS to the bag. They are taken
-in batches
-from the subscriptions: 1850 messages a second cost 7 % of a core by this and 27 % by
-callbacks of an executor, measured in two processes at once.
+in batches from the subscriptions: 1850 messages a second cost 7 % of a core by this and
+27 % by callbacks of an executor, measured in two processes at once.
 """
 
 from __future__ import annotations
@@ -31,23 +30,28 @@ from sst_ros.runtime.settings import RecorderParameters
 from sst_ros.scene.loads import JOINTS
 
 _DEPTH = 10000
+"""Messages of a topic that are kept until they are taken."""
 _TAKE_PERIOD_S = 0.02
+"""Period in which messages are taken."""
 _LOOK_PERIOD_S = 0.2
+"""Period of looks for new topics."""
 _LOG_PERIOD_S = 5.0
-_OF_A_RUN = ": run"  # end of the name of a simulator's status in /diagnostics
+"""What is waited for is not logged more often."""
+_OF_A_RUN = ": run"
+"""End of the name of a simulator's status in /diagnostics."""
 
 
 def own_topics(
-    requested: Iterable[str], default: Iterable[str]
+    requested: Iterable[str], default_nodes: Iterable[str]
 ) -> dict[str, topics.Endpoint]:
     """Return the topics of our nodes, by their full names.
 
     The nodes are those whose private topics are requested (NODE/scene, NODE/reference,
-    ...), and those of these full names: a last word such as `commands` alone says
-    nothing.
+    ...), and those of the full names `default_nodes`: a last word such as `commands`
+    alone says nothing.
     """
     tables = (topics.CONTROLLER, topics.SIMULATOR)
-    nodes = set(default)
+    nodes = set(default_nodes)
     for topic in requested:
         node, _, name = topic.rpartition("/")
         for table in tables:
@@ -126,10 +130,11 @@ class Recorder(Worker[RecorderParameters]):
         self._requested = {
             self.node.resolve_topic_name(topic) for topic in parameters.topics if topic
         }
-        default = (f"sst_{command}" for command in ("simulator", "inverse_dynamics"))
-        self._own = own_topics(
-            self._requested, map(self.node.resolve_topic_name, default)
-        )
+        default_nodes = [
+            self.node.resolve_topic_name(name)
+            for name in ("sst_simulator", "sst_inverse_dynamics")
+        ]
+        self._own = own_topics(self._requested, default_nodes)
         self._foreign = self._requested - self._own.keys()
         sampled = {
             topic
@@ -143,10 +148,10 @@ class Recorder(Worker[RecorderParameters]):
         self._failure: SstError | None = None
         self._timeout_s = parameters.timeout
         self._began_s = time.monotonic()
-        dated = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
-        self._bag = BagWriter(
-            Path(dated if parameters.output == "-" else parameters.output)
-        )
+        folder = parameters.output
+        if folder == "-":
+            folder = f"sst_bag_{datetime.now():%Y%m%d_%H%M%S}"
+        self._bag = BagWriter(Path(folder))
         self.node.get_logger().info(f"recording to {self._bag.path}")
         every(self.node, _LOOK_PERIOD_S, self._look)
         every(self.node, _TAKE_PERIOD_S, self._take)
@@ -154,7 +159,9 @@ class Recorder(Worker[RecorderParameters]):
     def close(self) -> None:
         """Take what has arrived and close the bag.
 
-        Name topics without messages, or some lost.
+        Raises:
+            SstError: topics have no messages, or some were lost.
+
         """
         self._take()
         if self._failure is not None:
@@ -168,45 +175,36 @@ class Recorder(Worker[RecorderParameters]):
             for name, recorded in self._recorded.items()
             if recorded.lost
         ]
-        faults = [f"no message of {_join(self._missing())}"] if self._missing() else []
-        faults += [f"lost messages: {_join(lost)}"] if lost else []
+        missing = self._missing()
+        faults = []
+        if missing:
+            faults.append(f"no message of {_join(missing)}")
+        if lost:
+            faults.append(f"lost messages: {_join(lost)}")
         if faults:
             raise SstError(
                 f"{self._bag.path} is incomplete: {'; '.join(faults)} ({text})"
             )
 
     def _missing(self) -> set[str]:
+        """Return the topics that must have messages and have none yet."""
         heard = {topic for topic, recorded in self._recorded.items() if recorded.heard}
         return (self._required | self._foreign) - heard
 
     def _look(self) -> None:
         """Subscribe to requested topics as they appear.
 
-        Print once that all of them are recorded.
-
-        Discovery finds the topics of a node one after the other: none may be new in the
-        last look. Commands come last: a player may wait for their subscribers, and then
-        expects that the run is recorded. So they are subscribed to when the simulator's
-        own topics have been heard.
+        Print once that all of them are recorded. Discovery finds the topics of a node
+        one after the other: none may be new in the last look.
         """
         silent = self._missing() & self._required
-        new = False
-        for topic, types in self.node.get_topic_names_and_types():
-            if (
-                topic in self._requested
-                and topic not in self._recorded.keys() | self._unknown
-            ):
-                new = True
-                own = self._own.get(topic)
-                own = own if own and own.type_name in types else None
-                if not (silent and own and own.use == topics.SUBSCRIBES):
-                    self._subscribe(topic, own.type_name if own else types[0], own)
+        is_any_new = self._record_new_topics(is_heard=not silent)
         if self._ready:
             return
         waiting = silent | (self._foreign - self._recorded.keys())
         text = f"waiting for {_join(waiting or self._requested)}"
         log = self.node.get_logger()
-        if self._recorded and not (new or waiting):
+        if self._recorded and not (is_any_new or waiting):
             self._ready = True
             print(f"ready: {len(self._recorded)} topics", flush=True)
         elif self._timeout_s and time.monotonic() - self._began_s > self._timeout_s:
@@ -215,23 +213,44 @@ class Recorder(Worker[RecorderParameters]):
         else:
             log.info(text, throttle_duration_sec=_LOG_PERIOD_S, skip_first=True)
 
+    def _record_new_topics(self, *, is_heard: bool) -> bool:
+        """Subscribe to requested topics that have appeared; return whether any has.
+
+        Commands come last, when the simulator's own topics are heard: a player may wait
+        for subscribers of its commands, and then expects that the run is recorded.
+        """
+        is_any_new = False
+        for topic, types in self.node.get_topic_names_and_types():
+            is_taken = topic in self._recorded or topic in self._unknown
+            if topic not in self._requested or is_taken:
+                continue
+            is_any_new = True
+            own = self._own.get(topic)
+            if own is None or own.type_name not in types:
+                first_type, *_ = types
+                self._subscribe(topic, first_type, None)
+            elif is_heard or own.use != topics.SUBSCRIBES:
+                self._subscribe(topic, own.type_name, own)
+        return is_any_new
+
     def _subscribe(
         self, topic: str, type_name: str, own: topics.Endpoint | None
     ) -> None:
+        """Record a topic of a type; `own` is its row in our tables, if it is ours."""
         # a name that others chose must not get to the import
         if not self._bag.knows(type_name):
             text = f"{topic} is not recorded: its type {type_name} is unknown"
             self.node.get_logger().error(text)
             self._unknown.add(topic)
             return
-        offers = [
-            info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)
-        ]
-        offers = [own.qos()] if own else offers
+        if own is not None:  # whatever discovery has found
+            offers = [own.qos()]
+        else:
+            publishers = self.node.get_publishers_info_by_topic(topic)
+            offers = [publisher.qos_profile for publisher in publishers]
         if not offers:
             return
-        # That which all publishers can serve; of a topic of ours whatever discovery has
-        # found.
+        # What all publishers can serve.
         durability = DurabilityPolicy.VOLATILE
         reliability = ReliabilityPolicy.BEST_EFFORT
         if all(
@@ -252,16 +271,24 @@ class Recorder(Worker[RecorderParameters]):
         self._recorded[topic] = RecordedTopic(subscription, connection, counted, shared)
 
     def _take(self) -> None:
+        """Write what has arrived; end where it cannot be written."""
         try:
             for topic in self._recorded.values():
-                while (taken := topics.take(topic.subscription)) is not None:
-                    data, info = taken
-                    self._bag.write(topic.connection, info["received_timestamp"], data)
-                    topic.count(data, info)
+                self._take_messages(topic)
             self._bag.save()
         except SstError as error:
             self._failure = error
             self.done.set()
+
+    def _take_messages(self, topic: RecordedTopic) -> None:
+        """Write the messages of a topic that have arrived."""
+        while True:
+            taken = topics.take(topic.subscription)
+            if taken is None:
+                return
+            data, info = taken
+            self._bag.write(topic.connection, info["received_timestamp"], data)
+            topic.count(data, info)
 
 
 def _bag_qos(qos: QoSProfile) -> interfaces.Qos:

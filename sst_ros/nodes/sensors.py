@@ -28,11 +28,9 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.runtime.settings import SimulatorParameters
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS
 from sst_ros.scene.loads import JOINTS
 from sst_ros.state import ZERO, Quaternion, Vector3
 
-_PASSIVE = (0.0,) * (len(JOINTS) - len(ACTUATED_JOINTS))
 _KIND_COUNT = len(JOINTS) // 3  # gamma, mu, beta
 _IMU_SEED = _KIND_COUNT  # the joints' noise has the seeds before it
 
@@ -45,9 +43,8 @@ class Numbers(NamedTuple):
     rates: Sequence[float]  # the same [rad/s]
     torque: Vector3  # of the actuators, over the step that ended [N m]
     body_rate: Vector3 = ZERO  # of the star in {E} [rad/s]
-    body_acceleration: Vector3 = (
-        ZERO  # its derivative, where a sensor needs it [rad/s^2]
-    )
+    # its derivative, where a sensor needs it [rad/s^2]
+    body_acceleration: Vector3 = ZERO
 
 
 class StateMessage(Protocol):
@@ -151,7 +148,8 @@ class ImuMessage:
 
     def fill(self, stamp: Time, numbers: Numbers) -> Imu:
         """Return the message."""
-        message, reading = self._message, self._transmit(self._measure(numbers))
+        reading = self._transmit(self._measure(numbers))
+        message = self._message
         message.header.stamp = stamp
         orientation = message.orientation
         orientation.x, orientation.y, orientation.z, orientation.w = reading.quaternion
@@ -160,7 +158,8 @@ class ImuMessage:
         return message
 
     def _measure(self, numbers: Numbers) -> ImuReading:
-        rate, point = numbers.body_rate, self._position
+        rate = numbers.body_rate
+        point = self._position
         tangential = cross3(numbers.body_acceleration, point)
         centripetal = cross3(rate, cross3(rate, point))
         free_fall = rotate_back(rotation_rows(numbers.quaternion), self._gravity)
@@ -213,14 +212,14 @@ class ReactionMessage:
     def fill(self, stamp: Time, numbers: Numbers) -> WrenchStamped:
         """Return the message."""
         self._message.header.stamp = stamp
-        transmitted = self._wrench(
+        force_x, force_y, force_z, moment_x, moment_y, moment_z = self._wrench(
             *numbers.quaternion,
             *numbers.body_rate,
             *numbers.torque,
             *numbers.body_acceleration,
         )
-        _set_vector(self._message.wrench.force, transmitted[:3])
-        _set_vector(self._message.wrench.torque, transmitted[3:])
+        _set_vector(self._message.wrench.force, (force_x, force_y, force_z))
+        _set_vector(self._message.wrench.torque, (moment_x, moment_y, moment_z))
         return self._message
 
 

@@ -34,14 +34,22 @@ UNSUPPORTED, RESULT_OK, NOT_FOUND, INCORRECT_STATE, FAILED = range(5)
 """Codes of Result."""
 INVALID_POSE = 101
 
-_LENGTH_DEVIATION = (
-    1e-3  # largest deviation of a quaternion's length from 1; it is normalised
-)
-# largest angle between an orientation and the assembly at its actuator angles [rad]
-_SAME = 1e-6
+_LENGTH_DEVIATION = 1e-3
+"""Largest deviation of a quaternion's length from 1; it is normalised."""
+_SAME_ASSEMBLY = 1e-6
+"""Largest angle between an orientation and the assembly at its actuator angles [rad].
+
+Rounding is far below, and other assemblies are far above.
+"""
 STOPPED, PLAYING, PAUSED, QUITTING = range(4)
-ALREADY_THERE, INCORRECT_TRANSITION = 101, 103
-SCOPE_TIME, SCOPE_STATE, SCOPE_SPAWNED, SCOPE_ALL = 1, 2, 4, 255
+"""States of a simulation."""
+ALREADY_THERE = 101
+INCORRECT_TRANSITION = 103
+"""Codes of Result for a change of the state."""
+SCOPE_STATE = 2
+SCOPE_SPAWNED = 4
+SCOPE_ALL = 255
+"""What is reset, as bits."""
 FEATURES = (10, 11, 20, 22, 24, 25, 26, 31, 32, 33)
 """Get and set the state of an entity, reset, reset of the state, get and set the state
 of the simulation, pause, one step, many steps, many steps by an action.
@@ -95,8 +103,10 @@ class SimulationInterfaces:
         base_frame: str,
         types: dict[str, Any],
     ) -> None:
-        self._loop, self._leave, self._base_frame = loop, leave, base_frame
-        self._types = types
+        self._loop = loop
+        self._leave = leave
+        self._base_frame = base_frame
+        self._types = types  # of messages, by their names
         self._space = ActuatorSpaceMap(loop.simulation.geometry)
 
     def get_simulator_features(self, _: Any, response: Any) -> Any:
@@ -196,37 +206,21 @@ class SimulationInterfaces:
         """
         if unknown := _refuse_other(request, response):
             return unknown
-        frame, pose, twist = (
-            request.state.header.frame_id,
-            request.state.pose,
-            request.state.twist,
-        )
+        frame = request.state.header.frame_id
         if frame not in ("", "world", self._base_frame):
             return answer(
                 response, FAILED, f"frame_id {frame!r} must be {self._base_frame}"
             )
-        state, refusal = self._loop.simulation.state, INVALID_POSE
-        quaternion, rate = state.quaternion, _turn(state.quaternion, state.body_rate)
+        state = self._loop.simulation.state
+        quaternion = state.quaternion
+        rate = _turn(state.quaternion, state.body_rate)
+        refusal = INVALID_POSE
         try:
             if getattr(request, "set_pose", True):  # the flags are new in 2.1
-                components = _numbers(pose.orientation, "xyzw")
-                if (
-                    not abs((length := float(np.linalg.norm(components))) - 1.0)
-                    < _LENGTH_DEVIATION
-                ):
-                    raise ValueError(f"orientation has length {length:.6g}, must be 1")
-                quaternion = tuple(component / length for component in components)
-                if any(_numbers(pose.position, "xyz")):
-                    raise ValueError(
-                        "position must be zero: the star turns about the origin"
-                    )
+                quaternion = _read_orientation(request.state.pose)
             if getattr(request, "set_twist", True):
                 refusal = FAILED
-                rate = _numbers(twist.angular, "xyz")
-                if any(_numbers(twist.linear, "xyz")):
-                    raise ValueError(
-                        "linear velocity must be zero: the star turns about O"
-                    )
+                rate = _read_angular_velocity(request.state.twist)
             refusal = INVALID_POSE
             joints = self._actuators(quaternion, rate)
         except (ValueError, AssemblyError, ArithmeticError) as error:
@@ -243,7 +237,8 @@ class SimulationInterfaces:
         action_type = self._types["SimulateSteps"]
 
         def run() -> None:
-            steps, reply = int(handle.request.steps), Reply(True, "")
+            steps = int(handle.request.steps)
+            reply = Reply(True, "")
             for steps_done in range(1, steps + 1):
                 if handle.is_cancel_requested:
                     break
@@ -271,17 +266,21 @@ class SimulationInterfaces:
         x, y, z = (rotation_matrix(quaternion).T @ rate).tolist()
         reference = self._space.of_star(quaternion, (x, y, z), ZERO)
         assembly = kinematics.admissible(self._space.geometry, reference.gamma)
-        if not angle_between(quaternion_of(assembly.rotation), quaternion) < _SAME:
+        if (
+            not angle_between(quaternion_of(assembly.rotation), quaternion)
+            < _SAME_ASSEMBLY
+        ):
             text = "the orientation belongs to another assembly mode"
             raise AssemblyError(text, np.array(reference.gamma))
         return reference.gamma, reference.gamma_dot
 
     def _fill(self, message: Any) -> Any:
         state = self._loop.simulation.state
-        stamp = divmod(self._loop.stamp_ns(state), NANOSECONDS)
-        message.header.stamp.sec, message.header.stamp.nanosec = stamp
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(self._loop.stamp_ns(state), NANOSECONDS)
         message.header.frame_id = self._base_frame
-        orientation, turning = message.pose.orientation, message.twist.angular
+        orientation = message.pose.orientation
+        turning = message.twist.angular
         orientation.x, orientation.y, orientation.z, orientation.w = state.quaternion
         turning.x, turning.y, turning.z = _turn(state.quaternion, state.body_rate)
         return message
@@ -290,39 +289,64 @@ class SimulationInterfaces:
         return answer_with(response, self._loop.ask(request))
 
     def _state(self) -> int:
-        if self._loop.phase is Phase.PAUSED and not self._loop.begun:
+        """Return the state of the simulation; a fault counts as paused."""
+        phase = self._loop.phase
+        if phase is Phase.PAUSED and not self._loop.begun:
             return STOPPED
-        return PLAYING if self._loop.phase in (Phase.WAITING, Phase.RUNNING) else PAUSED
+        if phase in (Phase.WAITING, Phase.RUNNING):
+            return PLAYING
+        return PAUSED
 
 
 def answer(response: Any, code: int, text: str = "") -> Any:
     """Fill the result of a response, and return the response."""
-    response.result.result, response.result.error_message = code, text
+    response.result.result = code
+    response.result.error_message = text
     return response
 
 
 def answer_with(response: Any, reply: Reply) -> Any:
     """Fill the result of a response from a reply of the run, and return it."""
-    return (
-        answer(response, RESULT_OK)
-        if reply.success
-        else answer(response, FAILED, reply.message)
-    )
+    if reply.success:
+        return answer(response, RESULT_OK)
+    return answer(response, FAILED, reply.message)
 
 
 def _refuse_other(request: Any, response: Any) -> Any:
     """Return the filled response for another entity than the star, else None."""
+    if request.entity == ENTITY_NAME:
+        return None
     text = f"there is no entity {request.entity!r}, only {ENTITY_NAME!r}"
-    return None if request.entity == ENTITY_NAME else answer(response, NOT_FOUND, text)
+    return answer(response, NOT_FOUND, text)
+
+
+def _read_orientation(pose: Any) -> Quaternion:
+    """Return the orientation of a pose; raise ValueError where it cannot be set."""
+    x, y, z, w = _numbers(pose.orientation, "xyzw")
+    length = float(np.linalg.norm((x, y, z, w)))
+    if not abs(length - 1.0) < _LENGTH_DEVIATION:
+        raise ValueError(f"orientation has length {length:.6g}, must be 1")
+    if any(_numbers(pose.position, "xyz")):
+        raise ValueError("position must be zero: the star turns about the origin")
+    return x / length, y / length, z / length, w / length
+
+
+def _read_angular_velocity(twist: Any) -> Vector3:
+    """Return that of a twist [rad/s]; raise ValueError where it cannot be set."""
+    x, y, z = _numbers(twist.angular, "xyz")
+    if any(_numbers(twist.linear, "xyz")):
+        raise ValueError("linear velocity must be zero: the star turns about O")
+    return x, y, z
 
 
 def _turn(quaternion: Quaternion, vector: Vector3) -> Vector3:
-    """From {E} into base_link."""
+    """Return a vector of {E} in base_link."""
     x, y, z = (rotation_matrix(quaternion) @ vector).tolist()
     return x, y, z
 
 
-def _numbers(message: Any, names: str) -> Any:
+def _numbers(message: Any, names: str) -> tuple[float, ...]:
+    """Return fields of a message; raise ValueError where one is not finite."""
     numbers = tuple(getattr(message, name) for name in names)
     if not all(map(math.isfinite, numbers)):
         raise ValueError(f"{type(message).__name__} must be finite numbers")

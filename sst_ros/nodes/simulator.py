@@ -32,14 +32,17 @@ from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import NANOSECONDS
 
-_RUN_END_S = 0.5  # wait for the thread of the run, where a step does not end
+_RUN_END_S = 0.5
+"""Longest wait for the thread of the run at the end: a step may not end."""
 FOLLOWED_STEP_NS = 200_000_000
 """Steps of a followed clock up to this length are simulated.
 
 Longer ones are dropped time.
 """
-_LONGEST_NODE_WAIT_S = 0.05
-_STANDSTILL_S = 1.0  # of a followed clock, which is reported
+_LONGEST_CLOCK_WAIT_S = 0.05
+"""Longest wait for a followed clock between two looks for what interrupts the run."""
+_STANDSTILL_S = 1.0
+"""A followed clock that stands for longer is reported."""
 
 
 class Simulator(Worker[SimulatorParameters]):
@@ -85,9 +88,11 @@ class Simulator(Worker[SimulatorParameters]):
         self._thread.start()
 
     def close(self) -> None:
-        """End the run, publish the last diagnostics.
+        """End the run, publish the last diagnostics and print the table of errors.
 
-        Raise the reason where the run has failed.
+        Raises:
+            SstError: the run has failed.
+
         """
         self._loop.stop()
         self.done.set()
@@ -154,12 +159,10 @@ class Simulator(Worker[SimulatorParameters]):
             resolve(topics.SIMULATOR[name].name)
             for name in ("commands", "commands_stamped")
         ]
-        values = self._diagnostics.values(
-            sum(map(self.node.count_publishers, commands))
-        )
-        level, text, news = self._diagnostics.status(
-            values, [*self._warnings(commands)]
-        )
+        publishers = sum(self.node.count_publishers(topic) for topic in commands)
+        values = self._diagnostics.values(publishers)
+        warnings = list(self._warnings(commands))
+        level, text, news = self._diagnostics.status(values, warnings)
         for line in news:
             self.node.get_logger().warning(line)
         self._topics.diagnostics.publish(
@@ -245,7 +248,9 @@ class RunServices:
     def __init__(
         self, node: Node, loop: RunLoop, settings: Callable[[], SimulatorParameters]
     ) -> None:
-        self._log, self._loop, self._settings = node.get_logger(), loop, settings
+        self._log = node.get_logger()
+        self._loop = loop
+        self._settings = settings
         for name in ("pause", "step", "reset", "set_state"):
             service = topics.SIMULATOR[name]
             node.create_service(
@@ -269,8 +274,10 @@ class RunServices:
 
     def _set_state(self, _: Any, response: Any) -> Any:
         settings = self._settings()
-        gamma, gamma_dot = settings.state_gamma, settings.state_gamma_dot
-        return self._answer(response, partial(self._loop.set_state, gamma, gamma_dot))
+        set_state = partial(
+            self._loop.set_state, settings.state_gamma, settings.state_gamma_dot
+        )
+        return self._answer(response, set_state)
 
     def _answer(self, response: Any, request: Callable[[], Reply]) -> Any:
         response.success, response.message = self._loop.ask(request)
@@ -314,7 +321,7 @@ class FollowedClock(SteadyTime):
 
     def sleep(self, seconds: float) -> None:
         """Wait for the next /clock."""
-        self._moved.wait(_LONGEST_NODE_WAIT_S)
+        self._moved.wait(_LONGEST_CLOCK_WAIT_S)
         self._moved.clear()
 
     def warnings(self) -> Iterator[str]:

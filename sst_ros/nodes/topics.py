@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics, services and actions of the nodes in one table.
 
-The nodes, the docs and the policies follow that table. The module also has who is at
-the other end of a topic, subscriptions whose owner takes the messages when he needs
-them, and goals of actions that end later than they are accepted.
+The nodes, the docs and the security policies follow that table. Behind it: who is at
+the other end of a topic, subscriptions whose owner takes the messages when they are
+needed, and goals of actions that end later than they are accepted.
 """
 
 from __future__ import annotations
@@ -28,12 +28,10 @@ from rclpy.type_support import check_for_type_support
 
 from sst_ros.runtime.torque_input import MOST_WAITING
 
-PUBLISHES, SUBSCRIBES, SERVES, CALLED_SERVICES = (
-    "publishes",
-    "subscribes",
-    "serves",
-    "calls",
-)
+PUBLISHES = "publishes"
+SUBSCRIBES = "subscribes"
+SERVES = "serves"
+CALLED_SERVICES = "calls"
 EXECUTES = "executes"
 
 SERVICE_QOS = QoSProfile(depth=1000)
@@ -443,7 +441,8 @@ def optional_types(node: Node, type_names: Sequence[str]) -> dict[str, Any] | No
         for type_name in type_names:
             message_class = message_type(type_name)
             check_for_type_support(message_class)
-            types[type_name.rpartition("/")[2]] = message_class
+            _, _, name = type_name.rpartition("/")
+            types[name] = message_class
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         node.get_logger().warning(
@@ -461,7 +460,8 @@ def subscribe(
 ) -> None:
     """Create a node's subscriptions to topics of its own table, by the names there."""
     for name, callback in callbacks.items():
-        endpoint, topic = own[name], own[name].name.format(simulator=simulator)
+        endpoint = own[name]
+        topic = endpoint.name.format(simulator=simulator)
         node.create_subscription(endpoint.kind, topic, callback, endpoint.qos())
 
 
@@ -506,9 +506,10 @@ def diagnostics(
 
     The level is 0, 1 or 2 for an error.
     """
-    status = DiagnosticStatus(level=bytes([level]), message=text)
     name = node.get_fully_qualified_name()
-    status.name, status.hardware_id = f"{name}: {subject}", name
+    status = DiagnosticStatus(level=bytes([level]), message=text)
+    status.name = f"{name}: {subject}"
+    status.hardware_id = name
     status.values = [KeyValue(key=key, value=str(x)) for key, x in values.items()]
     message = DiagnosticArray(status=[status])
     message.header.stamp = node.get_clock().now().to_msg()
@@ -575,9 +576,10 @@ class Reader:
         elif not self._published and until_ns < math.inf:
             return ()
         messages: list[Any] = []
-        while len(messages) < MOST_WAITING and (
-            following := self._next or self._take()
-        ):
+        while len(messages) < MOST_WAITING:
+            following = self._next or self._take()
+            if following is None:
+                break
             message, arrived_ns = following
             self.waiting = arrived_ns > until_ns
             self._next = following if self.waiting else None
@@ -589,7 +591,8 @@ class Reader:
     def _take(self) -> tuple[Any, int] | None:
         """Take the next message and find when it arrived; None if there is none."""
         # As bytes: otherwise an empty message is made each time that there is none.
-        if (taken := take(self._subscription)) is None:
+        taken = take(self._subscription)
+        if taken is None:
             return None
         data, information = taken
         message = deserialize_message(data, self._subscription.msg_type)

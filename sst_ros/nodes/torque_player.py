@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The torque player: answers every joint state with the torque of a hold.
 
-The hold begins at that state. A torque is held until the next sample. That of the
-hold's middle makes the motion second order in the period, that of its start first order
-only.
+The hold begins at that state and ends at the next sample. With the torque of its middle
+the error of the motion is of second order in the period, with that of its start of
+first order only.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 
 from sst_ros.errors import refusal
 from sst_ros.nodes import topics
-from sst_ros.nodes.process import AnsweringWorker
+from sst_ros.nodes.answering import AnsweringWorker
 from sst_ros.runtime.settings import PlayerParameters
 from sst_ros.scene import scene
 from sst_ros.scene.torque_profile import TorqueProfile, TorqueTable
@@ -23,11 +23,13 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
     """Worker of the process `torque_player`."""
 
     def __init__(self) -> None:
-        super().__init__("sst_torque_player", PlayerParameters)
+        super().__init__("sst_torque_player", PlayerParameters, topics.PLAYER)
         self._profile, self._duration = _load(self.parameters)
-        self._start_ns = self._last_ns = 0
+        self._start_ns = 0  # stamp of the first sample
+        self._last_ns = 0  # stamp of the last one
+        # at its start a torque does not depend on how long it is held
         self._warned = self.parameters.hold != "middle"
-        self.connect(topics.PLAYER)
+        self.connect()
 
     def preview(self) -> Vector3:
         """Return the torque of the first hold [N m]."""
@@ -36,7 +38,9 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
     def answer(self, state: JointState, stamp_ns: int) -> None:
         """Play the torque of the hold that a sample begins."""
         if not self.begun:
-            self.begun, self._start_ns, self._last_ns = True, stamp_ns, stamp_ns
+            self.begun = True
+            self._start_ns = stamp_ns
+            self._last_ns = stamp_ns
         elapsed_ns = stamp_ns - self._start_ns
         if elapsed_ns / NANOSECONDS < self._duration:
             self._check_period(stamp_ns)
@@ -56,12 +60,15 @@ class TorquePlayer(AnsweringWorker[PlayerParameters]):
         parameters = self.parameters
         end_ns = round(self._duration * NANOSECONDS)
         hold_ns = min(parameters.period_ns, max(0, end_ns - elapsed_ns))
-        at_ns = elapsed_ns + (hold_ns / 2 if parameters.hold == "middle" else 0)
-        return self._profile.at(at_ns / NANOSECONDS)
+        time_ns: float = elapsed_ns
+        if parameters.hold == "middle":
+            time_ns += hold_ns / 2
+        return self._profile.at(time_ns / NANOSECONDS)
 
     def _check_period(self, stamp_ns: int) -> None:
         """Warn once where the samples come at another period than that of `rate`."""
-        apart_ns, self._last_ns = stamp_ns - self._last_ns, stamp_ns
+        apart_ns = stamp_ns - self._last_ns
+        self._last_ns = stamp_ns
         period_ns = self.parameters.period_ns
         if self._warned or apart_ns in (0, period_ns):
             return

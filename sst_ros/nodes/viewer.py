@@ -30,10 +30,16 @@ from sst_ros.view.page import Page
 from sst_ros.view.source import RunStatus, ViewState
 
 _REPLY_S = 5.0
-# period of manual commands; the simulator drops commands older than half a second
+"""Longest wait of a button for the reply of a service."""
 _REPEAT_S = 0.05
+"""Period of manual commands; the simulator drops those older than half a second."""
 _LOOK_S = 0.5
+"""Period of looks for another node that commands the run."""
 _QUEUE = topics.VIEWER["joint_states"].depth
+_GAMMA = slice(0, 3)
+_MU = slice(3, 6)
+_BETA = slice(6, 9)
+"""Numbers of the nine joints that are those of a kind."""
 
 
 class Viewer(Worker[ViewerParameters]):
@@ -43,11 +49,14 @@ class Viewer(Worker[ViewerParameters]):
         super().__init__("sst_viewer", ViewerParameters)
         parameters = self.parameters
         self.scene: Scene | None = None
-        self._phase, self._status = "", RunStatus()
-        self._start_ns, self._time_ns = 0, 0
+        self._phase = ""
+        self._status = RunStatus()
+        self._start_ns = 0  # stamp of the first sample; 0 before
+        self._sample_ns = 0  # stamp of the last sample
         self._states: deque[ViewState] = deque(maxlen=_QUEUE)
-        self._torque: Vector3 = ZERO
-        self._controller, self._driving = "", False
+        self._torque: Vector3 = ZERO  # of the sliders [N m]
+        self._driving = False  # the sliders command the run
+        self._controller = ""  # another node that does
         self._commands: Publisher[Float64MultiArray] | None = None
         self._clients: dict[str, Client[Any, Any]] = {
             name: self.node.create_client(
@@ -58,9 +67,15 @@ class Viewer(Worker[ViewerParameters]):
             for name, endpoint in topics.VIEWER.items()
             if endpoint.use == topics.CALLED_SERVICES
         }
-        handlers = {"joint_states": self._take_state, "scene": self._take_scene}
-        handlers |= {"phase": self._take_phase, "diagnostics": self._take_diagnostics}
-        topics.subscribe(self.node, topics.VIEWER, parameters.simulator, **handlers)
+        topics.subscribe(
+            self.node,
+            topics.VIEWER,
+            parameters.simulator,
+            joint_states=self._take_state,
+            scene=self._take_scene,
+            phase=self._take_phase,
+            diagnostics=self._take_diagnostics,
+        )
         every(self.node, _REPEAT_S, self._repeat)
         every(self.node, _LOOK_S, self._look)
         self._page = Page(self, parameters.host, parameters.port)
@@ -89,7 +104,8 @@ class Viewer(Worker[ViewerParameters]):
         message: Any = (
             Trigger.Request() if paused is None else SetBool.Request(data=paused)
         )
-        future, answered = client.call_async(message), threading.Event()
+        future = client.call_async(message)
+        answered = threading.Event()
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(_REPLY_S):
             return False, f"no reply within {_REPLY_S:g} s"
@@ -100,7 +116,8 @@ class Viewer(Worker[ViewerParameters]):
 
     def apply(self, torque: Vector3) -> None:
         """Hold torques from now on; the timer publishes them."""
-        self._torque, self._driving = torque, True
+        self._torque = torque
+        self._driving = True
 
     def controller(self) -> str:
         """Name of another node that publishes commands; empty if there is none."""
@@ -112,13 +129,21 @@ class Viewer(Worker[ViewerParameters]):
             return
         stamp_ns = nanoseconds(message.header.stamp)
         if not is_idle(stamp_ns, message.header.frame_id):
-            self._start_ns, self._time_ns = self._start_ns or stamp_ns, stamp_ns
-        time = (
-            (self._time_ns - self._start_ns) / NANOSECONDS if self._start_ns else None
-        )
-        q, v = message.position, message.velocity
+            self._start_ns = self._start_ns or stamp_ns
+            self._sample_ns = stamp_ns
+        time: float | None = None
+        if self._start_ns:
+            time = (self._sample_ns - self._start_ns) / NANOSECONDS
+        angles = message.position
         self._states.append(
-            ViewState(time, q[:3], q[3:6], q[6:9], v[:3], message.effort[:3])
+            ViewState(
+                time,
+                gamma=angles[_GAMMA],
+                mu=angles[_MU],
+                beta=angles[_BETA],
+                gamma_dot=message.velocity[_GAMMA],
+                torque=message.effort[_GAMMA],
+            )
         )
 
     def _take_scene(self, message: String) -> None:
@@ -143,7 +168,8 @@ class Viewer(Worker[ViewerParameters]):
 
     def _look(self) -> None:
         """Look for another node that publishes commands, and leave the run to it."""
-        own, names = self.node.get_fully_qualified_name(), list[str]()
+        own = self.node.get_fully_qualified_name()
+        names: list[str] = []
         for topic in ("commands", "commands_stamped"):
             names += topics.publishers(
                 self.node, f"{self.parameters.simulator}/{topic}"
@@ -159,10 +185,10 @@ class Viewer(Worker[ViewerParameters]):
         """Publish the torque before the simulator drops the last one as too old."""
         if self._driving and self._commands is None:
             self._look()
-        if self._driving:
-            if self._commands is None:
-                simulator = self.parameters.simulator
-                self._commands = topics.VIEWER["commands"].publisher(
-                    self.node, simulator=simulator
-                )
-            self._commands.publish(Float64MultiArray(data=array("d", self._torque)))
+        if not self._driving:
+            return
+        if self._commands is None:
+            self._commands = topics.VIEWER["commands"].publisher(
+                self.node, simulator=self.parameters.simulator
+            )
+        self._commands.publish(Float64MultiArray(data=array("d", self._torque)))

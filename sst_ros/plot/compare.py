@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -28,20 +28,32 @@ from sst_ros.figures import (
 from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.plot import pictures, workspace
 from sst_ros.plot.pictures import (
+    ERROR_KEY,
     JOINT_LETTERS,
+    JOINT_STATES_KEY,
+    ORIENTATION,
+    SCENE_KEY,
+    TICKS,
     LegCurves,
     Picture,
     draw_legs,
     tick_torques,
 )
 from sst_ros.recording.recording import Signals
-from sst_ros.recording.topic_tables import SCENE_TOPIC
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Drawn: TypeAlias = "Sequence[tuple[Signals, str, dict[str, Any]]]"
-"""Runs with their names and styles."""
+
+class DrawnRun(NamedTuple):
+    """A run, its name in the legend, and the style of its curves."""
+
+    run: Signals
+    name: str
+    look: dict[str, Any]
+
+
+Drawn: TypeAlias = Sequence[DrawnRun]
 
 
 def _overlay(
@@ -57,11 +69,12 @@ def _overlay(
             LegCurves.of(name, run, scale * run.legs(quantity), look)
             for run, name, look in runs
         ]
-        below = f"largest difference\nfrom the first {label.partition(' ')[2]}"
+        _, _, unit = label.partition(" ")
+        below = f"largest difference\nfrom the first {unit}"
         figure = draw_legs(label, legs, below)
         axes = figure.axes[-1]
         axes.set_yticks([])  # none until a run differs
-        first = runs[0][0]
+        first = runs[0].run
         for run, name, look in runs[1:]:
             rows_of_first, rows = _common(first, run)
             distance = scale * np.abs(
@@ -85,21 +98,19 @@ def _overlay(
 
 
 def _torques(runs: Drawn) -> Figure:
+    """Draw the torques of the ticks of all runs."""
     curves = [LegCurves(name, *tick_torques(run), look) for run, name, look in runs]
     return draw_legs("τ [N m]", curves)
 
 
 def _sphere(runs: Drawn) -> Figure:
-    scene = runs[0][0].scene
+    """Draw the paths of E of all runs in the workspace of the first one's scene."""
+    scene = runs[0].run.scene
     assert scene is not None
-    paths = [(label, pictures.directions(run), look) for run, label, look in runs]
+    paths = [(name, pictures.directions(run), look) for run, name, look in runs]
     return workspace.draw_paths(scene, paths)
 
 
-JOINT_STATES_KEY = "joint_states"
-ERROR_KEY = "tracking_error"
-TICKS = "applied_torques"
-TURN_KEY = "orientation"
 COMPARISON_PICTURES = {
     "gamma": Picture(
         "Actuator angles", (JOINT_STATES_KEY,), _overlay("gamma", "γ [deg]", DEGREES)
@@ -113,9 +124,7 @@ COMPARISON_PICTURES = {
         _overlay("gamma_error", "Δγ [rad]"),
     ),
     "torques": Picture("Applied torques", (TICKS,), _torques),
-    "sphere": Picture(
-        "Path of E in the workspace", (TURN_KEY, SCENE_TOPIC.key), _sphere
-    ),
+    "sphere": Picture("Path of E in the workspace", (ORIENTATION, SCENE_KEY), _sphere),
 }
 
 
@@ -131,22 +140,25 @@ def draw_comparison(
     refuse_unless(
         "compare", ("bags", len(runs), 2 <= len(runs) <= len(LINES), requirement)
     )
-    all_runs = list(zip(runs, labels(runs), LINES, strict=False))
+    all_runs = [
+        DrawnRun(run, name, look)
+        for run, name, look in zip(runs, labels(runs), LINES, strict=False)
+    ]
     paths: list[Path] = []
     missing: dict[str, str] = {}
     for name in pictures.chosen_names(only, COMPARISON_PICTURES):
         title, needs, make = COMPARISON_PICTURES[name]
-        drawn = []
-        incomplete = []
-        for run, label, look in all_runs:
-            if set(needs) & set(run.missing):
-                incomplete.append(label)
+        drawn: list[DrawnRun] = []
+        incomplete: list[str] = []  # names of runs that lack something
+        for candidate in all_runs:
+            if set(needs) & set(candidate.run.missing):
+                incomplete.append(candidate.name)
             else:
-                drawn.append((run, label, look))
+                drawn.append(candidate)
         if incomplete:
-            labels_text = ", ".join(incomplete)
-            missing[name] = f"without {labels_text}: no {' or '.join(needs)} there"
-        if len(drawn) > 1 and drawn[0][0] is runs[0]:
+            names = ", ".join(incomplete)
+            missing[name] = f"without {names}: no {' or '.join(needs)} there"
+        if len(drawn) > 1 and drawn[0].run is runs[0]:
             paths += pictures.save(make(drawn), title, folder, f"compare_{name}")
         else:
             missing[name] = f"not drawn: {missing[name]}"
@@ -187,7 +199,7 @@ def _difference_table(first: Signals, run: Signals) -> DataFrame:
         angles = DataFrame(difference(names), columns=names)
         rates = DataFrame(difference(rate_names), columns=names)
     turn = Series(dtype=float)
-    if TURN_KEY not in absent:
+    if ORIENTATION not in absent:
         of_first = first.take(*pictures.QUATERNION_COLUMNS)[rows_of_first]
         of_run = run.take(*pictures.QUATERNION_COLUMNS)[rows]
         turn = Series(angle_between(of_first, of_run))

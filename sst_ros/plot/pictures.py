@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,7 +31,13 @@ from sst_ros.figures import (
     stack,
 )
 from sst_ros.files import write_into
-from sst_ros.mechanism.geometry import Array, Geometry, rotation_matrix, zyz_angles
+from sst_ros.mechanism.geometry import (
+    Array,
+    Geometry,
+    rotation_matrix,
+    star_direction,
+    zyz_angles,
+)
 from sst_ros.mechanism.rates import body_rates
 from sst_ros.plot import workspace
 from sst_ros.recording.recording import Signals
@@ -54,45 +60,45 @@ FIGURE_NUMBERS = {
 }
 """Number of a picture in the paper, by the name of the scene."""
 ASSUMPTION = "assumed inertias: the paper's are lost"
-# an axis never shows less than this, so that rounding is a flat line
 LEAST_POSITION_M = 0.05
 LEAST_ANGLE_DEG = 1.0
+"""An axis never shows a smaller range, so that rounding is a flat line."""
 POSITION = "position of E in {B} [m]"
 ZYZ = "θφψ"
 
 
 class Picture(NamedTuple):
-    """A picture: what it shows, the topics it needs, what draws it.
-
-    It cannot be drawn without the topics of the keys `needs`. What draws that of one
-    run takes the run and its scene, which is there if it is needed.
-    """
+    """A picture of one run, or of several."""
 
     title: str
-    needs: tuple[str, ...]
+    needs: tuple[str, ...]  # keys of the topics without which it cannot be drawn
+    #: takes a run and its scene, which is there if it is needed; or several runs
     make: Callable[..., Figure]
 
 
-Curves: TypeAlias = "tuple[str, Sequence[str], Callable[[Signals], Array]]"
-"""Curves over time in one panel.
+class CurvePanel(NamedTuple):
+    """Curves over time in one panel."""
 
-The parts are the label of the axis, names, and a column (n,) each of a run.
-"""
+    label: str  # of the axis
+    names: Sequence[str]
+    values: Callable[[Signals], Array]  # of a run: a column for each name
 
 
-def curves(*panels: Curves, height: float = 2.6) -> Callable[[Signals, Scene], Figure]:
+def curves(
+    *panels: CurvePanel, height: float = 2.6
+) -> Callable[[Signals, Scene], Figure]:
     """Return what draws panels one above the other."""
 
     def draw(run: Signals, _: Scene) -> Figure:
-        drawn = [Panel(label, names, values(run)) for label, names, values in panels]
+        drawn = [Panel(panel.label, panel.names, panel.values(run)) for panel in panels]
         return figures.draw_panels(run.seconds(), drawn, height, gaps=run.gaps())
 
     return draw
 
 
-def legs(label: str, quantity: str, letter: str, scale: float = 1.0) -> Curves:
+def legs(label: str, quantity: str, letter: str) -> CurvePanel:
     """Return a panel of one quantity of the three legs."""
-    return label, leg_names(letter), lambda run: scale * run.legs(quantity)
+    return CurvePanel(label, leg_names(letter), lambda run: run.legs(quantity))
 
 
 def joints(
@@ -159,7 +165,7 @@ def draw_legs(label: str, curves: Sequence[LegCurves], *below: str) -> Figure:
 
 def position_of_e(scene: Scene, quaternion: Array) -> Array:
     """Position of E in {B} [m], shape (n, 3)."""
-    return scene.star.radius * rotation_matrix(quaternion)[:, :, 2]
+    return scene.star.radius * star_direction(rotation_matrix(quaternion))
 
 
 def caption(name: str, title: str, scene: str | None) -> tuple[str, str]:
@@ -211,23 +217,21 @@ def draw_path(scene: Scene, paths: Mapping[str, Array]) -> Figure:
     figure = Figure(figsize=(6.4, 6.4))
     axes = figure.add_subplot(projection="3d")
     geometry = Geometry.of(scene)
-    base, star = scene.base.radius, scene.star.radius
-    outline = np.concatenate(workspace.sides(geometry, 40))
-    axes.plot(
-        *(base * outline).T, color=GREY, linewidth=1.6, label="base triangle P₁P₂P₃"
-    )
+    base = scene.base.radius
+    star = scene.star.radius
+    x, y, z = np.concatenate(workspace.sides(geometry, 40)).T
+    outline = {"color": GREY, "linewidth": 1.6, "label": "base triangle P₁P₂P₃"}
+    axes.plot(base * x, base * y, base * z, **outline)
     if star != base:
-        image = {
-            "linewidth": 0.9,
-            "linestyle": ":",
-            "label": "its image on the sphere of E",
-        }
-        axes.plot(*(star * outline).T, color=GREY, **image)
-    middle = geometry.v.sum(axis=0) / np.linalg.norm(geometry.v.sum(axis=0))
-    # outside are the numbers of the axes
-    inside = geometry.v + 0.22 * (middle - geometry.v)
-    for name, point in zip(leg_names("P"), base * inside, strict=True):
-        axes.text(*point, name, ha="center", va="center")
+        label = "its image on the sphere of E"
+        image = {"color": GREY, "linewidth": 0.9, "linestyle": ":", "label": label}
+        axes.plot(star * x, star * y, star * z, **image)
+    corners = geometry.v
+    middle = corners.sum(axis=0) / np.linalg.norm(corners.sum(axis=0))
+    # The names are inside: outside are the numbers of the axes.
+    name_places = base * (corners + 0.22 * (middle - corners))
+    for name, place in zip(leg_names("P"), name_places, strict=True):
+        axes.text(*place, name, ha="center", va="center")
     positions = [position_of_e(scene, quaternion).T for quaternion in paths.values()]
     for name, path, looks in zip(paths, positions, LINES, strict=False):
         axes.plot(*path, label=name, **looks)
@@ -303,11 +307,24 @@ def _torques(run: Signals, _: Scene) -> Figure:
     return draw_legs("τ [N m]", series)
 
 
-def _ticks(run: Signals) -> tuple[Any, Any, Array]:
-    """Begin and end of each tick [ns], shape (m,), and its torques [N m], (m, 3)."""
-    start = run.time_ns("ticks")
-    length = run.take("length", table="ticks")[:, 0].astype(np.int64)
-    return start, start + length, run.legs("tau", "ticks")
+class _Ticks(NamedTuple):
+    """The ticks of a run, m of them."""
+
+    start_ns: Any  # shape (m,)
+    end_ns: Any
+    torque: Array  # [N m], shape (m, 3)
+
+    @property
+    def are_apart(self) -> Any:
+        """Whether ticks are lost between a tick and the next, shape (m - 1,)."""
+        return self.start_ns[1:] != self.end_ns[:-1]
+
+
+def _ticks(run: Signals) -> _Ticks:
+    """Return the recorded ticks of a run."""
+    start_ns = run.time_ns("ticks")
+    length_ns = run.take("length", table="ticks")[:, 0].astype(np.int64)
+    return _Ticks(start_ns, start_ns + length_ns, run.legs("tau", "ticks"))
 
 
 def tick_torques(run: Signals) -> tuple[Array, Array]:
@@ -315,10 +332,11 @@ def tick_torques(run: Signals) -> tuple[Array, Array]:
 
     A gap between ticks is nan.
     """
-    start, end, torque = _ticks(run)
-    seconds = np.stack([start, end], axis=1).ravel() / NANOSECONDS
-    torques = np.repeat(torque, 2, axis=0)
-    gaps = 2 * (np.flatnonzero(start[1:] != end[:-1]) + 1)
+    ticks = _ticks(run)
+    ends_ns = np.stack([ticks.start_ns, ticks.end_ns], axis=1)
+    seconds = ends_ns.ravel() / NANOSECONDS
+    torques = np.repeat(ticks.torque, 2, axis=0)
+    gaps = 2 * (np.flatnonzero(ticks.are_apart) + 1)
     seconds_with_gaps = np.insert(seconds, gaps, seconds[gaps])
     return seconds_with_gaps, np.insert(torques, gaps, np.nan, axis=0)
 
@@ -351,18 +369,20 @@ def work(run: Signals) -> Array:
     time = run.time_ns("samples")
     gamma = run.true_legs("gamma")
     rate = run.true_legs("gamma_dot")
-    start, end, torque = _ticks(run)
+    ticks = _ticks(run)
     finite = np.isfinite(gamma).all(axis=1) & np.isfinite(rate).all(axis=1)
     if np.count_nonzero(finite) < 2:
         return np.full(gamma.shape, np.nan)
     angles = CubicHermiteSpline(time[finite] / NANOSECONDS, gamma[finite], rate[finite])
-    steps = torque * (angles(end / NANOSECONDS) - angles(start / NANOSECONDS))
-    steps[1:][start[1:] != end[:-1]] = np.nan
-    steps[start < time[0]] = 0.0
+    angles_at_start = angles(ticks.start_ns / NANOSECONDS)
+    angles_at_end = angles(ticks.end_ns / NANOSECONDS)
+    steps = ticks.torque * (angles_at_end - angles_at_start)
+    steps[1:][ticks.are_apart] = np.nan
+    steps[ticks.start_ns < time[0]] = 0.0
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    ended_ticks = np.searchsorted(end, time, side="right")
-    at_tick_end = (time == time[0]) | np.isin(time, end)
-    return np.asarray(np.where(at_tick_end[:, None], total[ended_ticks], np.nan))
+    ended_ticks = np.searchsorted(ticks.end_ns, time, side="right")
+    is_tick_end = (time == time[0]) | np.isin(time, ticks.end_ns)
+    return np.asarray(np.where(is_tick_end[:, None], total[ended_ticks], np.nan))
 
 
 def _energy(run: Signals, scene: Scene) -> Figure:
@@ -417,7 +437,7 @@ def broken_quaternions(run: Signals) -> Array:
 
 def directions(run: Signals) -> Array:
     """Direction of E in {B} at each sample, and nan in gaps, shape (n, 3)."""
-    return rotation_matrix(broken_quaternions(run))[:, :, 2]
+    return star_direction(rotation_matrix(broken_quaternions(run)))
 
 
 def _sphere(run: Signals, scene: Scene) -> Figure:
@@ -429,6 +449,11 @@ def _sphere(run: Signals, scene: Scene) -> Figure:
 def _power(run: Signals) -> Array:
     """Power of each actuator at the end of each step [W]."""
     return run.true_legs("tau") * run.true_legs("gamma_dot")
+
+
+def _total_power(run: Signals) -> Array:
+    """Power of the actuators together [W], shape (n, 1)."""
+    return np.asarray(_power(run).sum(axis=1)[:, None])
 
 
 JOINT_STATES_KEY = "joint_states"
@@ -447,14 +472,14 @@ _CONTROL = curves(
     legs("feedback [N m]", "tau_feedback", "τ"),
 )
 _POWERS = curves(
-    ("power τₖ γ̇ₖ [W]", ACTUATOR_LABELS, _power),
-    ("all three [W]", ["sum"], lambda run: _power(run).sum(axis=1)[:, None]),
+    CurvePanel("power τₖ γ̇ₖ [W]", ACTUATOR_LABELS, _power),
+    CurvePanel("all three [W]", ["sum"], _total_power),
 )
 _ANGLE_CURVES = joints(JOINT_LETTERS, "deg", DEGREES)
 _RATE_CURVES = joints(
     {f"{name}_dot": f"{letter}̇" for name, letter in JOINT_LETTERS.items()}, "rad/s"
 )
-_WORK = curves(("work [J]", ACTUATOR_LABELS, work), height=3.2)
+_WORK = curves(CurvePanel("work [J]", ACTUATOR_LABELS, work), height=3.2)
 RUN_PICTURES = {
     "path_of_E": Picture("Path of point E", (ORIENTATION, SCENE_KEY), _path),
     "position_of_E": Picture(
@@ -502,7 +527,8 @@ def draw_run(
     missing: dict[str, str] = {}
     for name in chosen_names(only, RUN_PICTURES):
         picture = RUN_PICTURES[name]
-        if absent := [key for key in picture.needs if key in run.missing]:
+        absent = [key for key in picture.needs if key in run.missing]
+        if absent:
             missing[name] = "the bag has no " + ", no ".join(absent)
             continue
         scene = run.scene.name if run.scene else None

@@ -33,17 +33,22 @@ from sst_ros.figures import (
     styled,
 )
 from sst_ros.mechanism import workspace
-from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.mechanism.geometry import Array, Geometry, star_direction
 from sst_ros.mechanism.workspace import OrientationMap
 from sst_ros.scene.scene import Scene
 
 if TYPE_CHECKING:  # the room needs python-flint
     from sst_ros.proof.zones import ProvenZone
 
-# levels of cond J; above all are the same
 CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)
+"""Levels of cond J; all above them have one colour."""
 _ALARM = "#d1182b"
-ZONE_DIVISIONS = 50  # of an edge of the triangle on which a zone is drawn
+ZONE_DIVISIONS = 50
+"""Divisions of an edge of the triangle on which a zone is drawn."""
+_LEAST_TORSION_DEG = 1e-9
+"""Range of the colours where no torsion is proven."""
+_SIDE_POINTS = 61
+"""Points by which a side of the base triangle is drawn, odd: one is its middle."""
 
 
 @styled
@@ -60,8 +65,8 @@ def plot_workspace(*charts: OrientationMap, titles: Sequence[str] = ()) -> Figur
     refuse_unless("plot_workspace", ("charts, titles", arguments, fits, requirement))
     figure = Figure(figsize=(13.5, 4.3 * len(charts)))
     rows = figure.subfigures(len(charts), 1, squeeze=False)[:, 0]
-    names = titles or ["E on the base triangle"] * len(charts)
-    for row, chart, title in zip(rows, charts, names, strict=True):
+    row_titles = titles or ["E on the base triangle"] * len(charts)
+    for row, chart, title in zip(rows, charts, row_titles, strict=True):
         _draw_row(row, chart, title)
     return figure
 
@@ -94,7 +99,7 @@ def _draw_row(row: Any, chart: OrientationMap, title: str) -> None:
         (ends, "o", 2.0, BLUE, "det J1 = 0 at the edge"),
     ):
         if len(singular):
-            x, y = project(chart.geometry, singular.rotation[:, :, 2])
+            x, y = project(chart.geometry, star_direction(singular.rotation))
             condition_axes.plot(x, y, marker, markersize=size, color=colour, alpha=0.8)
             condition_axes.plot([], [], "o", markersize=4, color=colour, label=label)
             condition_axes.legend(loc="upper right", fontsize=8, frameon=False)
@@ -119,35 +124,43 @@ def plot_zone(zone: ProvenZone) -> Figure:
     else:
         figure = Figure(figsize=(10.5, 4.9))
         s, faces = workspace.triangle_directions(geometry, ZONE_DIVISIONS)
-        turns = np.degrees(zone.turns_at(s))
-        panels = figure.subplots(1, 2)
+        _, open_torsion, proven_torsion = np.degrees(zone.turns_at(s)).T
+        proven_axes, open_axes = figure.subplots(1, 2)
         x, y = project(geometry, s)
         mesh = Triangulation(x, y, faces)
-        corners = turns[faces]  # shape (triangles, 3, 3)
-        for axes, shown, title in (
-            (panels[0], corners[:, :, 2].min(axis=1), "Proven torsion, at least"),
+        for axes, torsion, title in (
             (
-                panels[1],
-                corners[:, :, 1].max(axis=1),
+                proven_axes,
+                proven_torsion[faces].min(axis=1),
+                "Proven torsion, at least",
+            ),
+            (
+                open_axes,
+                open_torsion[faces].max(axis=1),
                 "Torsion neither proven nor refuted, at most",
             ),
         ):
-            most = max(float(shown.max()), 1e-9)
-            levels = MaxNLocator(10).tick_values(0.0, most)
-            steps = BoundaryNorm(levels, len(levels) - 1)
-            colours = colormaps["viridis"].resampled(len(levels) - 1)
-            filled = axes.tripcolor(mesh, facecolors=shown, cmap=colours, norm=steps)
-            bar = figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02)
-            bar.set_label("deg", fontsize=9)
+            _draw_torsion(axes, mesh, torsion)
             axes.set_title(title, fontsize=10.5, color=INK, loc="center")
             draw_triangle(axes, geometry)
     figure.suptitle(f"{zone.scene.name}: {zone.shares}", fontsize=12, color=INK)
     return figure
 
 
+def _draw_torsion(axes: Axes, mesh: Triangulation, torsion: Array) -> None:
+    """Colour triangles by angles [deg], in steps, with a bar that says which."""
+    most = max(float(torsion.max()), _LEAST_TORSION_DEG)
+    levels = MaxNLocator(10).tick_values(0.0, most)
+    steps = BoundaryNorm(levels, len(levels) - 1)
+    colours = colormaps["viridis"].resampled(len(levels) - 1)
+    filled = axes.tripcolor(mesh, facecolors=torsion, cmap=colours, norm=steps)
+    bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02)
+    bar.set_label("deg", fontsize=9)
+
+
 def _draw_statuses(axes: Axes, geometry: Geometry, zone: ProvenZone) -> None:
     """Draw the direction of E in the middle of each box, by its status."""
-    s = zone.middles()[:, :, 2]
+    s = star_direction(zone.middles())
     for status, colour, label in (
         (-1, VERMILION, "refuted"),
         (0, GREY, "open"),
@@ -160,9 +173,11 @@ def _draw_statuses(axes: Axes, geometry: Geometry, zone: ProvenZone) -> None:
 
 
 def triangles(chart: OrientationMap) -> NDArray[np.intp]:
-    """Triangles of the directions of a map, shape (n, 3)."""
+    """Return the triangles between the directions of a map, shape (n, 3)."""
+    # n divisions of an edge make (n + 1) (n + 2) / 2 directions.
     divisions = round((math.sqrt(8 * len(chart.s) + 1) - 3) / 2)
-    return workspace.triangle_directions(chart.geometry, divisions)[1]
+    _, faces = workspace.triangle_directions(chart.geometry, divisions)
+    return faces
 
 
 def _panel(
@@ -242,19 +257,27 @@ def draw_triangle(axes: Axes, geometry: Geometry) -> None:
     """Draw the base triangle with its corners and the sense of gamma along its arcs."""
     reach = float(np.hypot(*project(geometry, geometry.v)).max())
     arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.5}
-    for k, side in enumerate(sides(geometry, 61), 1):
+    middle = _SIDE_POINTS // 2
+    for k, side in enumerate(sides(geometry, _SIDE_POINTS), 1):
         x, y = project(geometry, side)
         axes.plot(x, y, color=INK, lw=1.8, solid_capstyle="round")
+        points = np.stack([x, y], axis=1)
         # gamma_k grows from P_k to P_k+1.
-        axes.annotate("", (x[32], y[32]), (x[28], y[28]), arrowprops=arrow)
-        corner, middle = np.array([x[0], y[0]]), np.array([x[30], y[30]])
-        axes.plot(*corner, "o", markersize=5, color=INK)
-        for point, name in ((middle, f"$\\gamma_{k}$"), (corner, f"$P_{k}$")):
-            x, y = point * (1.0 + 0.1 / np.hypot(*point))
-            axes.text(x, y, name, fontsize=12, color=INK, ha="center", va="center")
-    ylim = -0.86 * reach, 1.2 * reach
-    axes.set(aspect="equal", xlim=(-1.22 * reach, 1.22 * reach), ylim=ylim)
+        axes.annotate("", points[middle + 2], points[middle - 2], arrowprops=arrow)
+        axes.plot(x[0], y[0], "o", markersize=5, color=INK)
+        _name_outside(axes, points[middle], f"$\\gamma_{k}$")
+        _name_outside(axes, points[0], f"$P_{k}$")
+    # Room for the names: below there is none.
+    xlim = (-1.22 * reach, 1.22 * reach)
+    ylim = (-0.86 * reach, 1.2 * reach)
+    axes.set(aspect="equal", xlim=xlim, ylim=ylim)
     axes.set_axis_off()
+
+
+def _name_outside(axes: Axes, point: Array, name: str) -> None:
+    """Write a name next to a point, away from the middle of the triangle."""
+    x, y = point * (1.0 + 0.1 / np.hypot(*point))
+    axes.text(x, y, name, fontsize=12, color=INK, ha="center", va="center")
 
 
 def project(geometry: Geometry, s: Array) -> tuple[Array, Array]:
@@ -269,6 +292,7 @@ def project(geometry: Geometry, s: Array) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=4)
 def _map(scene: Scene) -> OrientationMap:
+    """Return a map that is fine enough for the background of paths."""
     return workspace.workspace(Geometry.of(scene), divisions=40, turns=72)
 
 
@@ -277,11 +301,11 @@ def draw_paths(scene: Scene, paths: Sequence[tuple[str, Array, Looks]]) -> Figur
 
     Paths are directions (n, 3) each. One path has its ends.
     """
-    figure, chart = Figure(figsize=(7.2, 5.6)), _map(scene)
+    figure = Figure(figsize=(7.2, 5.6))
     axes = figure.subplots()
-    _panel(
-        axes, chart, triangles(chart), np.degrees(chart.best_margin), condition=False
-    )
+    chart = _map(scene)
+    margin = np.degrees(chart.best_margin)
+    _panel(axes, chart, triangles(chart), margin, condition=False)
     for name, s, looks in paths:
         x, y = project(chart.geometry, s)
         axes.plot(x, y, color="white", linewidth=4.0, zorder=1.9)  # seen on each colour

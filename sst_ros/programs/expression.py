@@ -61,6 +61,7 @@ _ON_FLOATS: dict[str, Callable[..., float]] = {
     )
     for op, text in _TEMPLATES.items()
 }
+"""Operations on constants: of the same text, so a constant has the program's bits."""
 _SLOPE_RULES: dict[str, Callable[..., Value]] = {
     "add": lambda f, x, y, dx, dy: dx + dy,
     "sub": lambda f, x, y, dx, dy: dx - dy,
@@ -88,17 +89,17 @@ Those of f(x) are by x: `_slopes_of` multiplies them by dx.
 
 @dataclass(frozen=True)
 class Routine:
-    """A program of `inputs` numbers that other programs call by its name.
+    """A program that other programs call by its name.
 
-    A call is one operation, whose parts are its `outputs` results.
+    A call is one operation; each of its results is a "part" of it.
     """
 
     name: str
-    inputs: int
-    outputs: int
+    inputs: int  #: how many numbers it takes
+    outputs: int  #: how many it returns
 
     def __call__(self, *arguments: Value) -> tuple[Value, ...]:
-        """Note a call in the graph of the arguments, at least one an expression."""
+        """Add a call to the graph of the arguments, at least one an expression."""
         if len(arguments) != self.inputs:
             raise TypeError(
                 f"{self.name} takes {self.inputs} numbers, not {len(arguments)}"
@@ -120,13 +121,16 @@ class Graph:
 
     def node(self, op: Operation, *args: Value) -> Expression:
         """Return the expression op(args), an old one where there is one."""
-        # A node ("n") is never equal to a constant ("c"); sums and products are the
-        # same in either order.
-        keys = [
-            ("n", a.index) if isinstance(a, Expression) else ("c", _origin(a))
-            for a in args
-        ]
-        key = (op, *(sorted(keys) if op in ("add", "mul") else keys))
+        keys: list[tuple[str, Any]] = []
+        for operand in args:
+            # A node ("n") is never equal to a constant ("c").
+            if isinstance(operand, Expression):
+                keys.append(("n", operand.index))
+            else:
+                keys.append(("c", _origin(operand)))
+        if op in ("add", "mul"):  # the same in either order
+            keys.sort()
+        key = (op, *keys)
         if key not in self._expressions:
             self._expressions[key] = Expression(self, len(self.nodes))
             self.nodes.append((op, args))
@@ -134,10 +138,10 @@ class Graph:
 
 
 class Expression:
-    """A number that is not known yet; arithmetic on it is noted in its graph.
+    """A number without a value; arithmetic on it is added to its graph.
 
-    One that `is_present` counts as nonzero: scenarios differ in it, so that its term is
-    there.
+    One that `is_present` counts as nonzero, so that no term of it is left out: it is a
+    number that scenarios differ in.
     """
 
     __slots__ = ("graph", "index", "is_present")
@@ -152,7 +156,8 @@ class Expression:
     def __add__(self, operand: Value) -> Value:
         if _is(operand, 0.0):
             return self
-        mine, theirs = _drop_minus(self), _drop_minus(operand)
+        mine = _drop_minus(self)
+        theirs = _drop_minus(operand)
         if theirs is not None:
             return self - theirs
         if mine is not None and isinstance(operand, Expression):
@@ -179,7 +184,8 @@ class Expression:
             return 0.0
         if _is(operand, 1.0) or _is(operand, -1.0):
             return self if operand > 0.0 else -self
-        mine, theirs = _drop_minus(self), _drop_minus(operand)
+        mine = _drop_minus(self)
+        theirs = _drop_minus(operand)
         if mine is not None and theirs is not None:
             return mine * theirs
         if mine is not None:
@@ -215,7 +221,7 @@ class Expression:
         return True
 
     def apply(self, op: str, *args: Value) -> Value:
-        """Note a function of this expression, or of `args`."""
+        """Add a function of this expression, or of `args`, to the graph."""
         return self.graph.node(op, *(args or (self,)))
 
 
@@ -302,12 +308,16 @@ def number_constants(value: Any, origin: Place = ()) -> Any:
 
     Its sections become objects that are not checked.
     """
-    numbers = {
-        place: x for place, x in leaves(value).items() if abs(x) not in (0.0, 1.0)
-    }
-    return rebuild(
-        value, {place: Number(x, (*origin, *place)) for place, x in numbers.items()}
-    )
+    numbers: dict[Place, Number] = {}
+    for place, constant in leaves(value).items():
+        if abs(constant) not in (0.0, 1.0):
+            numbers[place] = Number(constant, (*origin, *place))
+    return rebuild(value, numbers)
+
+
+def references(operands: Iterable[float | int]) -> list[int]:
+    """Return the operands that are numbers of inputs or steps, not constants."""
+    return [operand for operand in operands if isinstance(operand, int)]
 
 
 @dataclass(frozen=True)
@@ -338,12 +348,12 @@ class Program:
     def prune(self, outputs: Sequence[float | int]) -> Program:
         """Return the program of some outputs alone, without steps they do not need."""
         inputs = len(self.inputs)
-        needed = {x for x in outputs if isinstance(x, int)}
+        needed = set(references(outputs))
         # Operands are earlier than their step: one pass from the last step finds all.
         for number in reversed(range(inputs, inputs + len(self.steps))):
             if number in needed:
                 _, operands = self.steps[number - inputs]
-                needed.update(x for x in operands if isinstance(x, int))
+                needed.update(references(operands))
         step_numbers = sorted(number for number in needed if number >= inputs)
         return self._select_steps(self.inputs, range(inputs), step_numbers, outputs)
 
@@ -355,18 +365,18 @@ class Program:
         """
         inputs = len(self.inputs)
         is_late = [number >= shared for number in range(inputs)]
-        for op, operands in self.steps:
+        early_steps = []
+        late_steps = []
+        used = set(references(self.outputs))  # by the second program
+        for number, (op, operands) in enumerate(self.steps, start=inputs):
             calls = isinstance(op, Routine) or op == "part"
-            is_late.append(
-                calls or any(is_late[x] for x in operands if isinstance(x, int))
-            )
-        numbers = range(inputs, inputs + len(self.steps))
-        early_steps = [number for number in numbers if not is_late[number]]
-        late_steps = [number for number in numbers if is_late[number]]
-        late_operands = [
-            x for number in late_steps for x in self.steps[number - inputs][1]
-        ]
-        used = {x for x in (*late_operands, *self.outputs) if isinstance(x, int)}
+            if calls or any(is_late[x] for x in references(operands)):
+                is_late.append(True)
+                late_steps.append(number)
+                used.update(references(operands))
+            else:
+                is_late.append(False)
+                early_steps.append(number)
         shared_results = sorted(x for x in used if not is_late[x])
         names = (
             *(f"shared_{i}" for i in range(len(shared_results))),
@@ -405,46 +415,65 @@ class Program:
         templates: Mapping[str, str] = _TEMPLATES,
     ) -> str:
         """Source of a flat function of all inputs that returns the tuple of outputs."""
-        steps, _, results = self.split((), templates=templates)
-        head = f"def {name}({', '.join(self.inputs)}):"
-        lines = [head, *(f"    {line}" for line in steps)]
-        return "\n".join([*lines, f"    return ({', '.join(results)},)\n"])
+        steps, results = self.lines(templates)
+        lines = [f"def {name}({', '.join(self.inputs)}):"]
+        lines += [f"    {line}" for line in steps]
+        lines.append(f"    return ({', '.join(results)},)\n")
+        return "\n".join(lines)
 
-    def split(
-        self,
-        late: Container[int],
-        templates: Mapping[str, str] = _TEMPLATES,
-    ) -> tuple[list[str], list[str], list[str]]:
-        """Return the lines v0 = .., v1 = .., a step each, and the outputs.
+    def lines(
+        self, templates: Mapping[str, str] = _TEMPLATES
+    ) -> tuple[list[str], list[str]]:
+        """Return the lines v0 = .., v1 = .., a step each, and the outputs' texts."""
+        write = self.operand_writer()
+        lines = []
+        for i, (op, operands) in enumerate(self.steps):
+            if isinstance(op, Routine):
+                text = f"{op.name}({', '.join(map(write, operands))})"
+            elif op == "part":
+                call, place = operands
+                text = f"{write(call)}[{int(place)}]"
+            else:
+                text = templates[op].format(*map(write, operands))
+            lines.append(f"v{i} = {text}")
+        return lines, [write(output) for output in self.outputs]
 
-        First the lines that depend on no `late` input, then those that do, and then
-        the operands that are the outputs.
+    def split(self, late: Container[int]) -> tuple[list[str], list[str], list[str]]:
+        """Return `lines` in two parts, then the texts of the outputs.
+
+        The first part depends on none of the inputs whose numbers are in `late`.
         """
-        operand_names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
+        lines, outputs = self.lines()
         is_late = [number in late for number in range(len(self.inputs))]
-
-        def write_operand(operand: float | int) -> str:
-            if isinstance(operand, int):
-                return operand_names[operand]
-            return repr(operand) if operand >= 0.0 else f"({operand!r})"
-
         early_lines: list[str] = []
         late_lines: list[str] = []
-        for i, (op, operands) in enumerate(self.steps):
-            is_late.append(any(is_late[x] for x in operands if isinstance(x, int)))
-            if isinstance(op, Routine):
-                text = f"{op.name}({', '.join(map(write_operand, operands))})"
-            elif op == "part":
-                text = f"{write_operand(operands[0])}[{int(operands[1])}]"
-            else:
-                text = templates[op].format(*map(write_operand, operands))
-            line = f"v{i} = {text}"
+        for line, (_, operands) in zip(lines, self.steps, strict=True):
+            is_late.append(any(is_late[x] for x in references(operands)))
             if is_late[-1]:
                 late_lines.append(line)
             else:
                 early_lines.append(line)
-        outputs = [write_operand(output) for output in self.outputs]
         return early_lines, late_lines, outputs
+
+    def operand_writer(self) -> Callable[[float | int], str]:
+        """Return a function that writes an operand, in Python and in C.
+
+        It writes the name of an input, v0, v1, .. for a step, or a constant.
+        """
+        names = [*self.inputs, *(f"v{i}" for i in range(len(self.steps)))]
+
+        def write(operand: float | int) -> str:
+            if isinstance(operand, int):
+                return names[operand]
+            return constant_text(operand)
+
+        return write
+
+
+def constant_text(value: float) -> str:
+    """Write a constant, in brackets if it is negative."""
+    text = repr(float(value))
+    return f"({text})" if text.startswith("-") else text
 
 
 class Slots:
@@ -523,7 +552,10 @@ def _slopes_of(
     """Return the slopes of outputs by forward mode, of those of the inputs by name."""
     slopes: list[Value] = []
     for index, (op, args) in enumerate(nodes):
-        d = [slopes[a.index] if isinstance(a, Expression) else 0.0 for a in args]
+        d: list[Value] = []  # slopes of the arguments
+        for operand in args:
+            is_traced = isinstance(operand, Expression)
+            d.append(slopes[operand.index] if is_traced else 0.0)
         expression = Expression(graph, index)
         if isinstance(op, Routine):
             raise TypeError(
@@ -614,11 +646,12 @@ def compile_for_arrays(
     NumPy's own sine and others may differ from libm's in the last bit: `exact` takes
     libm's for each element, which takes ten times as long.
     """
-    names: dict[str, Any] = {"where": np.where, "max": _larger, "sqrt": np.sqrt}
+    names: dict[str, Any] = {"where": np.where, "max": _larger}
     for name, of_floats in MATH_FUNCTIONS.items():
-        of_arrays = getattr(np, {"atan2": "arctan2"}.get(name, name))
-        if name != "sqrt":  # IEEE 754 leaves it no choice
-            names[name] = _by_element(of_floats) if exact else of_arrays
+        numpy_name = "arctan2" if name == "atan2" else name
+        names[name] = getattr(np, numpy_name)
+        if exact and name != "sqrt":  # IEEE 754 leaves a square root no choice
+            names[name] = _by_element(of_floats)
     if exact:
         names["tanh"] = _tanh_of_array
     execute(program.source("function", templates=_ON_ARRAYS), names)
@@ -640,13 +673,12 @@ def _by_element(function: Callable[..., float]) -> Callable[..., Any]:
         except (ArithmeticError, ValueError):
             return math.nan
 
-    of_objects = np.frompyfunc(of_floats, 2 if function is math.atan2 else 1, 1)
+    argument_count = 2 if function is math.atan2 else 1
+    of_objects = np.frompyfunc(of_floats, argument_count, 1)
     return lambda *arrays: np.asarray(of_objects(*arrays), dtype=float)
 
 
 def divide(sizes: Mapping[str, int], numbers: Iterable[Any]) -> dict[str, Any]:
     """Divide numbers into tuples by name, as inputs of a program come."""
-    remaining_numbers = iter(numbers)
-    return {
-        name: tuple(islice(remaining_numbers, size)) for name, size in sizes.items()
-    }
+    remaining = iter(numbers)
+    return {name: tuple(islice(remaining, size)) for name, size in sizes.items()}

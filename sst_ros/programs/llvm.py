@@ -105,7 +105,7 @@ class RowFunction:
         signature = ctypes.CFUNCTYPE(None, ctypes.c_int64, *(pointer,) * 4)
         self._call = signature(code.address(row_name(name, shared)))
         self._code = code
-        # one more, so that the array is never empty
+        # one more, so that the array is never empty and has an address
         self._numbers = np.array([*module.numbers, 0.0])
         self._numbers_address = self._numbers.ctypes.data
 
@@ -128,6 +128,7 @@ class RowFunction:
         self._check_rows(inputs, outputs)
         begin, end, _ = columns.indices(len(outputs[0]))
         blocks_end = begin + (end - begin) // LANES * LANES
+        # one more, as in `_numbers`
         scalars = (ctypes.c_double * (len(shared) + 1))(*shared)
         if blocks_end > begin:
             ins = _addresses(inputs, begin)
@@ -156,7 +157,8 @@ class RowFunction:
             raise ValueError(f"{count} columns: must be a multiple of {LANES}")
         if count == 0:  # the loop is made for one column at least
             return
-        ins, outs = _row_addresses(inputs), _row_addresses(outputs)
+        ins = _row_addresses(inputs)
+        outs = _row_addresses(outputs)
         self._run(count, (ctypes.c_double * 1)(), ins.ctypes.data, outs.ctypes.data)
 
     def bind(
@@ -175,7 +177,8 @@ class RowFunction:
         if count % LANES:
             raise ValueError(f"{count} columns: must be a multiple of {LANES}")
         rows = inputs, outputs  # they live as long as the function
-        ins, outs = _addresses(inputs, 0), _addresses(outputs, 0)
+        ins = _addresses(inputs, 0)
+        outs = _addresses(outputs, 0)
         scalars = (ctypes.c_double * self.shared)()
         call = self._call
         fixed = count, ctypes.addressof(scalars), self._numbers_address, ins, outs
@@ -202,9 +205,9 @@ def _addresses(rows: Sequence[NDArray[np.float64]], first: int) -> Any:
 
 def _row_addresses(table: NDArray[np.float64]) -> NDArray[np.uint64]:
     """Return the addresses of the rows of a contiguous table."""
-    rows, step = table.shape[0], table.strides[0]
+    step, _ = table.strides
     first = table.ctypes.data
-    return np.arange(first, first + rows * step, step, dtype=np.uint64)
+    return np.arange(first, first + len(table) * step, step, dtype=np.uint64)
 
 
 def write_module(
@@ -276,7 +279,8 @@ class MachineCode:
 
     def __init__(self, engine: Any) -> None:
         self._engine = engine
-        weakref.finalize(self, _close, engine).atexit = False
+        finalizer = weakref.finalize(self, _close, engine)
+        finalizer.atexit = False  # the end of the process frees all
 
     def address(self, name: str) -> int:
         """Return the address of a function."""

@@ -100,14 +100,18 @@ def _reach(programs: Mapping[str, Program], name: str) -> set[str]:
     return names
 
 
-def _type_of(width: int) -> str:
-    return "double" if width == 1 else f"<{width} x double>"
+def _type_of(width: int, element: str = "double") -> str:
+    """Return the type of a number, or of a vector with one in each lane."""
+    if width == 1:
+        return element
+    return f"<{width} x {element}>"
 
 
 def _declare(widths: Iterable[int]) -> str:
     lines = []
     for width in widths:
-        number_type, suffix = _type_of(width), _suffix(width)
+        number_type = _type_of(width)
+        suffix = _suffix(width)
         for name in ("sqrt", "fabs"):
             lines.append(f"declare {number_type} @llvm.{name}.{suffix}({number_type})")
     for name in MATH_FUNCTIONS:
@@ -126,18 +130,16 @@ def _function_name(name: str, width: int) -> str:
 
 
 def _constant(value: float, width: int) -> str:
-    """Return a number as LLVM writes it: its bits."""
-    bits = f"0x{struct.unpack('>Q', struct.pack('>d', value))[0]:016X}"
-    if width == 1:
-        return bits
-    return "<" + ", ".join([f"double {bits}"] * width) + ">"
+    """Return a number as LLVM writes it, its bits, in each lane."""
+    (bits,) = struct.unpack(">Q", struct.pack(">d", value))
+    return _repeat(f"0x{bits:016X}", width, "double")
 
 
-def _whole_constant(value: int, width: int) -> str:
-    """Return a whole number as an operand."""
+def _repeat(constant: str, width: int, element: str) -> str:
+    """Return a constant of a type in each lane."""
     if width == 1:
-        return str(value)
-    return "<" + ", ".join([f"i64 {value}"] * width) + ">"
+        return constant
+    return "<" + ", ".join([f"{element} {constant}"] * width) + ">"
 
 
 def _pointer(target_type: str) -> str:
@@ -152,8 +154,7 @@ def _write_function(
     With `inline` it becomes part of the function that calls it.
     """
     writer = _Writer(program, slots, width)
-    for number, (op, operands) in enumerate(program.steps):
-        writer.write_step(f"%v{number}", op, operands)
+    writer.write_steps()
     for number, output in enumerate(program.outputs):
         writer.store(writer.operand_text(output), "%o", number)
     array = f"{_pointer(_type_of(width))} noalias"
@@ -171,8 +172,7 @@ def _write_tanh(width: int) -> str:
     """Write the hyperbolic tangent as a function that becomes part of its callers."""
     program = tanh_program()
     writer = _Writer(program, Slots(), width)
-    for number, (op, operands) in enumerate(program.steps):
-        writer.write_step(f"%v{number}", op, operands)
+    writer.write_steps()
     number_type = _type_of(width)
     name = _function_name(_TANH, width)
     head = f"define internal {number_type} {name}({number_type} %a0)"
@@ -184,14 +184,15 @@ class _Writer:
     """Lines of one function; `first_lines` are those at its beginning."""
 
     def __init__(self, program: Program, slots: Slots, width: int) -> None:
+        self._program = program
         self._slots = slots
         self._width = width
         self._number_type = _type_of(width)
         self._operand_names = [f"%a{i}" for i in range(len(program.inputs))]
         self._operand_names += [f"%v{i}" for i in range(len(program.steps))]
-        self._numbers: dict[int, str] = {}
-        self._calls: dict[str, str] = {}
-        self._places = 0
+        self._numbers: dict[int, str] = {}  # names of loaded numbers by slot
+        self._calls: dict[str, str] = {}  # arrays of results by the name of a call
+        self._places = 0  # addresses that have been taken
         self.first_lines: list[str] = []
         self.lines: list[str] = []
         for number in range(len(program.inputs)):
@@ -207,7 +208,12 @@ class _Writer:
             return self._operand_names[operand]
         return _constant(operand, self._width)
 
-    def write_step(
+    def write_steps(self) -> None:
+        """Write all operations of the program."""
+        for number, (op, operands) in enumerate(self._program.steps):
+            self._write_step(f"%v{number}", op, operands)
+
+    def _write_step(
         self, result: str, op: str | Routine, operands: Sequence[float | int]
     ) -> None:
         """Write one operation of a program."""
@@ -237,8 +243,8 @@ class _Writer:
             zero = self.operand_text(0.0)
             self._choose(result, zero, texts[0], zero, texts[0])
         elif op == "step":
-            one, zero = self.operand_text(1.0), self.operand_text(0.0)
-            self._choose(result, texts[0], zero, one, zero)
+            zero = self.operand_text(0.0)
+            self._choose(result, texts[0], zero, self.operand_text(1.0), zero)
         elif op == "max":
             self._choose(result, texts[1], texts[0], texts[1], texts[0])
         elif op == "select":
@@ -260,7 +266,7 @@ class _Writer:
 
     def _choose(self, result: str, left: str, right: str, yes: str, no: str) -> None:
         """Write: yes where left > right, else no."""
-        truth = "i1" if self._width == 1 else f"<{self._width} x i1>"
+        truth = _type_of(self._width, "i1")
         condition = f"%c{result[1:]}"
         self._put(condition, f"fcmp ogt {self._number_type} {left}, {right}")
         self._put(
@@ -276,9 +282,9 @@ class _Writer:
         would have no value where k is no number.
         """
         number_type = self._number_type
-        integer_type = "i64" if self._width == 1 else f"<{self._width} x i64>"
-        mantissa_size = _whole_constant(52, self._width)
-        bits_of_one = _whole_constant(1023 << 52, self._width)
+        integer_type = _type_of(self._width, "i64")
+        mantissa_size = _repeat("52", self._width, "i64")
+        bits_of_one = _repeat(str(1023 << 52), self._width, "i64")
         name = f"%w{result[1:]}"
         self._put(
             f"{name}.k", f"fadd {number_type} {exponent}, {self.operand_text(TO_WHOLE)}"

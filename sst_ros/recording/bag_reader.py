@@ -42,9 +42,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from sst_ros.errors import InputError, refusal
 from sst_ros.scene.yaml_document import read_file, read_values
+from sst_ros.state import NANOSECONDS
 
-_DATA_END_SIZE = 9 + 4  # bytes of opcode and length, and of its content
 _HEAD = struct.Struct("<BQ")  # opcode and length, with which each record of MCAP begins
+_CHECKSUM_SIZE = 4  # bytes of a CRC-32
+_DATA_END_SIZE = _HEAD.size + _CHECKSUM_SIZE  # bytes of the record behind the data
 _PIECE = 1 << 20  # bytes read at once to check a file, which may exceed the memory
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _SQLITE_MAGIC = b"SQLite format 3\0"
@@ -126,6 +128,7 @@ class Bag:
         self.unverified = 0  # chunks without a checksum
         self._requested = requested
         self._damaged = damaged
+        self._empty = True  # no database has a message, of whatever topic
         self._unreadable: dict[str, InputError] = {}
 
     def messages(self) -> Iterator[Received]:
@@ -163,7 +166,6 @@ class Bag:
         """
         files, declared = self._files()
         counts = Counter[str]()
-        self._empty = True
         with tempfile.TemporaryDirectory() as folder:
             for path in files:
                 try:
@@ -172,7 +174,7 @@ class Bag:
                     for name, message_type, received_ns, data in read(
                         file, Path(folder)
                     ):
-                        if data[:4] == _ZSTD_MAGIC:  # compressed message by message
+                        if data[: len(_ZSTD_MAGIC)] == _ZSTD_MAGIC:
                             data = _decompress_message(data)
                         counts[name] += 1
                         yield name, message_type, received_ns, data
@@ -228,9 +230,8 @@ class Bag:
             if not self._damaged and (metadata_path.exists() or not self._list_files()):
                 reason = str(error).removeprefix("metadata.yaml: ")
                 raise self._not_whole(f"metadata.yaml: {reason}") from None
-        if not (files and all(map(Path.exists, files))) and (
-            self._damaged or not files
-        ):
+        are_there = bool(files) and all(map(Path.exists, files))
+        if not are_there and (self._damaged or not files):
             files = self._list_files()
         return files, counts
 
@@ -284,22 +285,20 @@ class Bag:
                 address = (own / path.name).absolute().as_uri()
             with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
                 topics = database.execute("SELECT id, name, type FROM topics")
-                chosen = {
-                    key: channel
-                    for key, *channel in topics
-                    if self._candidate(*channel)
-                }
+                chosen: dict[Any, tuple[str, str]] = {}
+                for topic_id, name, message_type in topics:
+                    if self._candidate(name, message_type) is not None:
+                        chosen[topic_id] = (name, message_type)
                 query = (
                     "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
                 )
                 query += f"({','.join('?' * len(chosen))}) ORDER BY timestamp"
-                for key, received_ns, data in database.execute(query, [*chosen]):
-                    yield *chosen[key], int(received_ns), data
+                for topic_id, received_ns, data in database.execute(query, [*chosen]):
+                    yield *chosen[topic_id], int(received_ns), data
                     count += 1
-                some = database.execute(
-                    "SELECT EXISTS (SELECT 1 FROM messages)"
-                ).fetchone()
-                self._empty = self._empty and not some[0]
+                any_message = "SELECT EXISTS (SELECT 1 FROM messages)"
+                (has_messages,) = database.execute(any_message).fetchone()
+                self._empty = self._empty and not has_messages
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise self._not_whole(error, f" after {count} messages") from None
 
@@ -317,15 +316,13 @@ class Bag:
         self, reason: object, where: str = "", advice: str = ""
     ) -> InputError:
         sqlite = ".db3" in self.path.suffixes or any(self.path.glob("*.db3*"))
-        by = (
-            "sqlite3 FILE .recover | sqlite3 NEW"
-            if sqlite
-            else "python -m sst_ros recover BAG"
-        )
+        command = "python -m sst_ros recover BAG"
+        if sqlite:
+            command = "sqlite3 FILE .recover | sqlite3 NEW"
         requirement = (
             "must be a whole rosbag2 recording, MCAP or sqlite3; "
             f"reading failed{where}: {_one_line(reason)}; "
-            f"{by} makes a whole one of what is intact{advice}"
+            f"{command} makes a whole one of what is intact{advice}"
         )
         return refusal(self.path, "bag", self.path.name, requirement)
 
@@ -352,8 +349,8 @@ class McapFile:
         self.damage: list[Damage] = []
         self.cut = False  # the file ends before its index does
         self.unverified = 0  # chunks without a checksum
-        # messages that were read, and that are known to be lost
-        self.count = self.lost = 0
+        self.count = 0  # messages that were read
+        self.lost = 0  # messages that are known to be lost
         self._origin_ns = 0
         self._schemas: dict[int, str] = {}
 
@@ -363,10 +360,8 @@ class McapFile:
         for damage in self.damage:
             line = f"{self.path.name}, byte {damage.offset}: {damage.reason}"
             if damage.end_ns:  # seconds after the first message
-                first, last = (
-                    (ns - self._origin_ns) / 1e9
-                    for ns in (damage.begin_ns, damage.end_ns)
-                )
+                first = (damage.begin_ns - self._origin_ns) / NANOSECONDS
+                last = (damage.end_ns - self._origin_ns) / NANOSECONDS
                 line += f" ({first:.3f} s to {last:.3f} s)"
             lines.append(line)
         if self.cut:
@@ -476,18 +471,16 @@ class McapFile:
             begin = footer.summary_start or footer_at
             file.seek(begin)
             content = file.read()
-            if footer.summary_crc not in (
-                0,
-                zlib.crc32(content[: -4 - len(MCAP0_MAGIC)]),
-            ):
+            # The checksum is the last field of the footer, which is the last record.
+            checked = content[: -_CHECKSUM_SIZE - len(MCAP0_MAGIC)]
+            if footer.summary_crc not in (0, zlib.crc32(checked)):  # 0: it has none
                 raise ValueError("index with wrong checksum")
             index = list(_records(content))
-            chunks = [chunk for chunk in index if isinstance(chunk, ChunkIndex)]
-            if any(
-                chunk.chunk_start_offset + chunk.chunk_length > begin
-                for chunk in chunks
-            ):
-                raise ValueError("index with wrong position")
+            for chunk in index:
+                if not isinstance(chunk, ChunkIndex):
+                    continue
+                if chunk.chunk_start_offset + chunk.chunk_length > begin:
+                    raise ValueError("index with wrong position")
             return index, begin
         except Exception as error:  # mcap raises anything on bad bytes
             self.damage.append(Damage(footer_at, _one_line(error)))
@@ -565,7 +558,7 @@ class McapFile:
             record = next(_records(file))
         if not isinstance(record, records.DataEnd) or file.tell() != end:
             self.damage.append(Damage(begin, "the end of the data section is missing"))
-        elif record.data_section_crc not in (0, checksum):
+        elif record.data_section_crc not in (0, checksum):  # 0: it has none
             self.damage.append(Damage(begin, "data section with wrong checksum"))
 
 
@@ -621,9 +614,11 @@ def _prepare(path: Path, folder: Path) -> tuple[Path, str]:
         path = target
     with path.open("rb") as file:
         begin = file.read(len(_SQLITE_MAGIC))
+    if begin.startswith(MCAP0_MAGIC):
+        return path, "mcap"
     named = _split_name(path)
     is_database = begin == _SQLITE_MAGIC or (named and named["storage"] == "db3")
-    return path, "db3" if is_database and begin[:8] != MCAP0_MAGIC else "mcap"
+    return path, "db3" if is_database else "mcap"
 
 
 def _magic(path: Path) -> bytes:

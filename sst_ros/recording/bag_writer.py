@@ -52,16 +52,20 @@ class _McapStorage:
 
     def add_msgtype(self, connection: Connection) -> None:
         definition = connection.msgdef
-        encoding = (
-            "ros2msg" if definition.format == MessageDefinitionFormat.MSG else "ros2idl"
+        is_msg = definition.format == MessageDefinitionFormat.MSG
+        self._schemas[connection.msgtype] = self._writer.register_schema(
+            name=connection.msgtype,
+            encoding="ros2msg" if is_msg else "ros2idl",
+            data=definition.data.encode(),
         )
-        named = connection.msgtype, encoding, definition.data.encode()
-        self._schemas[connection.msgtype] = self._writer.register_schema(*named)
 
     def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
-        offered = {"offered_qos_profiles": offered_qos_profiles}
-        named = connection.topic, "cdr", self._schemas[connection.msgtype], offered
-        self._channels[connection.id] = self._writer.register_channel(*named)
+        self._channels[connection.id] = self._writer.register_channel(
+            topic=connection.topic,
+            message_encoding="cdr",
+            schema_id=self._schemas[connection.msgtype],
+            metadata={"offered_qos_profiles": offered_qos_profiles},
+        )
 
     def write(
         self, connection: Connection, timestamp: int, data: bytes | memoryview
@@ -97,8 +101,8 @@ class BagWriter(Writer):
     def __init__(self, path: Path) -> None:
         self._typestore = message_types()
         self._flushed = time.monotonic()
-        given = "output", str(path), "must be a new folder"
-        with refuse_errors("recorder", *given, WriterError, OSError):
+        refused = "output", str(path), "must be a new folder"
+        with refuse_errors("recorder", *refused, WriterError, OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             super().__init__(
                 path, version=self.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP
@@ -129,23 +133,22 @@ class BagWriter(Writer):
         self._try(super().write, connection, timestamp, data)
 
     def save(self) -> None:
-        """Write all messages to the file, if that was a second ago."""
-        now = time.monotonic()
-        if (
-            isinstance(self.storage, _McapStorage)
-            and now - self._flushed >= FLUSH_PERIOD_S
-        ):
-            self._flushed = now
+        """Write all messages to the file, if that was FLUSH_PERIOD_S ago."""
+        time_s = time.monotonic()
+        is_due = time_s - self._flushed >= FLUSH_PERIOD_S
+        if is_due and isinstance(self.storage, _McapStorage):
+            self._flushed = time_s
             self._try(self.storage.flush)
 
     def close(self) -> None:
         """Write the index."""
         self._try(super().close)
 
-    def _try(self, act: Callable[..., None], *given: Any) -> None:
+    def _try(self, act: Callable[..., None], *arguments: Any) -> None:
+        """Do something to the file unless it is closed; abort if that fails."""
         try:
             if self.storage is not None:
-                act(*given)
+                act(*arguments)
         except OSError as error:
             with contextlib.suppress(OSError):
                 self.abort()
@@ -201,10 +204,13 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         str(target), "bag", str(target), "cannot be written", WriterError
     ):
         writer.close()
-    damage = [
-        *file.describe(),
-        *([f"{unknown} messages of unknown types"] if unknown else []),
-    ]
+    damage = file.describe()
+    if unknown:
+        damage.append(f"{unknown} messages of unknown types")
     return Recovered(
-        target, writer.messages, file.lost + unknown, file.cut, tuple(damage)
+        bag=target,
+        messages=writer.messages,
+        lost=file.lost + unknown,
+        cut=file.cut,
+        damage=tuple(damage),
     )

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import contextlib
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import model_of
@@ -38,7 +40,14 @@ from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import TorqueTable
 from sst_ros.simulation.tables import write_table
 from sst_ros.simulation.trajectory import RunRecord, Trajectory
-from sst_ros.state import NANOSECONDS, Explained, ReadOnly, cached_property, freeze
+from sst_ros.state import (
+    NANOSECONDS,
+    Explained,
+    Joints,
+    ReadOnly,
+    cached_property,
+    freeze,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,6 +66,9 @@ motion itself: those of a simulator agree to rounding.
 """
 LEAST_GAP = 10.0  # usual periods without a row over which no picture draws a line
 MEASURED_SHARE = 0.1  # of the samples that must be, as single ones are faults
+LEAST_SAMPLES = 2  # of a run, which has a duration
+LENGTH_ROUNDING = 1e-6  # of quaternions, whose length is 1
+JOINT_GROUPS = 7  # of three columns of joint states: angles and rates by kind, efforts
 
 
 class RecordedStatus(NamedTuple):
@@ -90,26 +102,10 @@ class Signals:
         """
         by_name = {}
         for name, listed in topics.TABLES.items():
-            recorded = [
-                rows for table in listed if len(rows := self.topic_series[table.key])
-            ]
-            if len(recorded) == 1:
-                by_name[name] = recorded[0]
-            elif recorded:
-                stamps = np.unique(
-                    np.concatenate([series.stamp_ns for series in recorded])
-                )
-                received = np.zeros(len(stamps), dtype=np.int64)
-                for series in recorded:
-                    index = np.searchsorted(stamps, series.stamp_ns)
-                    received[index] = np.where(
-                        received[index] > 0, received[index], series.received_ns
-                    )
-                columns = tuple(
-                    column for series in recorded for column in series.columns
-                )
-                values = np.hstack([series.at(stamps) for series in recorded])
-                by_name[name] = Series(columns, stamps, received, values)
+            series_of_table = [self.topic_series[table.key] for table in listed]
+            recorded = [series for series in series_of_table if len(series)]
+            if recorded:
+                by_name[name] = _join(recorded)
         return by_name
 
     @cached_property
@@ -119,7 +115,9 @@ class Signals:
         Those without a row of the run are among them.
         """
         missing = [key for key, series in self.topic_series.items() if not len(series)]
-        return (*missing, *([] if self.scene else [topics.SCENE_TOPIC.key]))
+        if self.scene is None:
+            missing.append(topics.SCENE_TOPIC.key)
+        return tuple(missing)
 
     def statuses_of(self, part: str, key: str) -> list[RecordedStatus]:
         """Diagnostics of a part of the node that publishes a topic.
@@ -128,11 +126,11 @@ class Signals:
         name of the node, as in a bag that was played under another name and recorded
         again.
         """
-        name = f"{self.bag.topics.get(key, '').rpartition('/')[0]}: {part}"
-        named = [
-            status for status in self.statuses if status.name.endswith(f": {part}")
-        ]
-        return [status for status in named if status.name == name] or named
+        node, _, _ = self.bag.topics.get(key, "").rpartition("/")
+        suffix = f": {part}"
+        statuses = [status for status in self.statuses if status.name.endswith(suffix)]
+        own = [status for status in statuses if status.name == node + suffix]
+        return own or statuses
 
     def time_ns(self, table: str) -> Integers:
         """Time of each row since the start of the run [ns].
@@ -148,9 +146,9 @@ class Signals:
         return np.asarray(self.time_ns(table) / NANOSECONDS)
 
     def gaps(self, table: str = "samples") -> Array:
-        """Return begin and end of the times [s] without a row, shape (g, 2).
+        """Return begin and end of the gaps between rows [s], shape (g, 2).
 
-        A time is one from LEAST_GAP usual periods of the rows on.
+        A gap is LEAST_GAP usual periods of the rows or longer.
         """
         times_ns = self.time_ns(table)
         spacing = np.diff(times_ns)
@@ -165,7 +163,8 @@ class Signals:
 
     def legs(self, name: str, table: str = "samples") -> Array:
         """Columns of the three legs, as in "gamma" or "tau_feedback", shape (n, 3)."""
-        return self.take(*(f"{name}_{leg}" for leg in (1, 2, 3)), table=table)
+        names = (f"{name}_{leg}" for leg in topics.LEG_NUMBERS)
+        return self.take(*names, table=table)
 
     def true_legs(self, name: str) -> Array:
         """Return true angles or rates, as `legs`.
@@ -176,9 +175,7 @@ class Signals:
         return self.legs(f"true_{name}" if recorded else name)
 
     def table(self, name: str = "samples") -> pd.DataFrame:
-        """Return a table as pandas, indexed by `time_ns`.
-
-        `attrs` describes each column.
+        """Return a table as pandas, indexed by `time_ns`; `attrs` describes columns.
 
         Columns in ns are whole numbers. Raises InputError where the recording has no
         such table.
@@ -189,13 +186,32 @@ class Signals:
         series = self.tables[name]
         columns = (*topics.TIMES, *series.columns)
         times = (self.time_ns(name), series.stamp_ns, series.received_ns)
-        numbers = {
-            column.name: values.astype(np.int64) if column.unit == "ns" else values
-            for column, values in zip(columns, (*times, *series.values.T), strict=True)
-        }
-        result: pd.DataFrame = require("pandas").DataFrame(numbers).set_index("time_ns")
-        result.attrs = {column.name: column.text for column in columns}
-        return result
+        arrays = {}
+        for column, values in zip(columns, (*times, *series.values.T), strict=True):
+            is_whole = column.unit == "ns"
+            arrays[column.name] = values.astype(np.int64) if is_whole else values
+        frame: pd.DataFrame = require("pandas").DataFrame(arrays).set_index("time_ns")
+        frame.attrs = {column.name: column.text for column in columns}
+        return frame
+
+
+def _join(recorded: list[Series]) -> Series:
+    """Put topics side by side at all stamps that any of them has.
+
+    A row was received when the first of them was that has this stamp.
+    """
+    if len(recorded) == 1:
+        return recorded[0]
+    stamps = np.unique(np.concatenate([series.stamp_ns for series in recorded]))
+    received = np.zeros(len(stamps), dtype=np.int64)
+    columns: tuple[topics.Column, ...] = ()
+    for series in recorded:
+        rows = np.searchsorted(stamps, series.stamp_ns)
+        is_known = received[rows] > 0
+        received[rows] = np.where(is_known, received[rows], series.received_ns)
+        columns += series.columns
+    values = np.hstack([series.at(stamps) for series in recorded])
+    return Series(columns, stamps, received, values)
 
 
 @dataclass
@@ -229,6 +245,7 @@ class _Heard:
             self._take_rows(self.table, message)
 
     def _take_rows(self, table: TopicTable, message: Received) -> None:
+        """Take the rows of a message, or note why it has none."""
         try:
             rows = table.rows(message.content)
         except topics.InvalidMessage as error:
@@ -285,12 +302,8 @@ def read_signals(
         raise refusal(path, "topics", listed, f"must have at least one of {endings}")
     scenes = of_run.get(topics.SCENE_TOPIC.key, nothing).scenes
     if len(scenes) > 1:
-        raise refusal(
-            path,
-            topics.SCENE_TOPIC.key,
-            len(scenes),
-            "the recording must hold one scene",
-        )
+        requirement = "the recording must hold one scene"
+        raise refusal(path, topics.SCENE_TOPIC.key, len(scenes), requirement)
     origin = f"{path}: {bag.topics.get(topics.SCENE_TOPIC.key)}"
     scene = yaml_document.read(Scene, next(iter(scenes)), origin) if scenes else None
     reported = of_run.get(topics.DIAGNOSTICS.key, nothing).statuses
@@ -312,15 +325,35 @@ def read_signals(
 
 def _find_start(topic_series: dict[str, Series]) -> int:
     """Return the first stamp of a run [ns], or reception where nothing is stamped."""
-    stamped = [
-        topic_series[table.key]
-        for table in topics.STAMPED
-        if len(topic_series[table.key])
-    ]
-    if stamped:
-        return min(int(series.stamp_ns[0]) for series in stamped)
-    received = [series for series in topic_series.values() if len(series)]
-    return min(int(series.received_ns[0]) for series in received)
+    present = {key: series for key, series in topic_series.items() if len(series)}
+    stamps = []
+    for table in topics.STAMPED:
+        if table.key in present:
+            stamps.append(int(present[table.key].stamp_ns[0]))
+    if stamps:
+        return min(stamps)
+    return min(int(series.received_ns[0]) for series in present.values())
+
+
+def _require_scene(signals: Signals) -> Scene:
+    """Return the scene of a recording that has the essential topics; else refuse it."""
+    absent = signals.absent
+    problems = [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]
+    if problems:
+        raise InputError(str(signals.bag.path), problems)
+    if signals.scene is None:
+        requirement = "the recording must hold one scene"
+        raise refusal(signals.bag.path, topics.SCENE_TOPIC.key, 0, requirement)
+    return signals.scene
+
+
+def _run_reports(signals: Signals) -> tuple[tuple[int, dict[str, str]], ...]:
+    """Return receptions [ns] and values of the simulator's reports of its run."""
+    reports = []
+    for status in signals.statuses_of("run", topics.SCENE_TOPIC.key):
+        if "phase" in status.values:
+            reports.append((status.received_ns, status.values))
+    return tuple(reports)
 
 
 class JointSamples(NamedTuple):
@@ -339,11 +372,8 @@ class JointSamples(NamedTuple):
 
     @classmethod
     def of(cls, series: Series, start_ns: int) -> JointSamples:
-        """Return the joint samples of a topic.
-
-        Its first one may be after the start of the run.
-        """
-        quantities = np.split(series.values, 7, axis=1)
+        """Return the joint samples of a topic, in a run that begins at a stamp."""
+        quantities = np.split(series.values, JOINT_GROUPS, axis=1)
         return cls(series.stamp_ns - start_ns, series.received_ns, *quantities)
 
 
@@ -366,6 +396,17 @@ class Ticks:
     def gaps(self) -> int:
         """How often a tick does not begin where the one before ended."""
         return int(np.count_nonzero(self.start_ns[1:] != self.end_ns[:-1]))
+
+    def known_between(self, times_ns: NDArray[Any]) -> Array:
+        """Return for how long [ns] torques are known from each time to the next.
+
+        There are n times [ns], and n - 1 intervals.
+        """
+        edges = np.stack([self.start_ns, self.end_ns], axis=1).ravel()
+        length = self.end_ns - self.start_ns
+        steps = np.stack([length, 0 * length], axis=1).ravel()
+        known_ns = np.append(0, np.cumsum(steps))[:-1]  # up to each edge
+        return np.diff(np.interp(times_ns, edges, known_ns))
 
 
 class Recording(Explained, ReadOnly):
@@ -421,65 +462,63 @@ class Recording(Explained, ReadOnly):
         self.signals = found
         self.path = found.bag.path
         self.table = found.table
-        absent = found.absent
-        problems = [absent[topic.key] for topic in ESSENTIAL if topic.key in absent]
-        if problems:
-            raise InputError(str(self.path), problems)
-        if found.scene is None:
-            raise refusal(
-                self.path,
-                topics.SCENE_TOPIC.key,
-                0,
-                "the recording must hold one scene",
-            )
-        self.scene = found.scene
+        self.scene = _require_scene(found)
         self.idle_states = found.idle_states
         self.foreign_states = found.foreign_states
-        self.missing = tuple(topic.key for topic in OPTIONAL if topic.key in absent)
-        runs = found.statuses_of("run", topics.SCENE_TOPIC.key)
-        self.reports = tuple(
-            (status.received_ns, status.values)
-            for status in runs
-            if "phase" in status.values
+        self.missing = tuple(
+            topic.key for topic in OPTIONAL if topic.key in found.absent
         )
-        self.diagnostics: dict[str, str] = self.reports[-1][1] if self.reports else {}
+        self.reports = _run_reports(found)
+        self.diagnostics: dict[str, str] = {}
+        if self.reports:
+            _, self.diagnostics = self.reports[-1]
         joints = _finite_rows(found, topics.JOINT_STATES)
         truth = _finite_rows(found, topics.TRUE_JOINT_STATES)
         orientation = _finite_rows(found, topics.ORIENTATION_TABLE)
         euler = _finite_rows(found, topics.EULER)
         ticks = _finite_rows(found, topics.TICK_TABLE)
-        if len(joints) < 2:
+        self._require_run(joints, ticks)
+        has_truth = len(truth) >= LEAST_SAMPLES
+        samples = truth if has_truth else joints
+        self.start_ns = min(int(samples.stamp_ns[0]), int(ticks.stamp_ns[0]))
+        self.measured = JointSamples.of(joints, self.start_ns)
+        self._truth: JointSamples | None = None
+        if has_truth:
+            self._truth = JointSamples.of(truth, self.start_ns)
+        # The attributes that are declared below this function.
+        vars(self).update((self._truth or self.measured)._asdict())
+        self.quaternion = orientation.at(samples.stamp_ns)
+        self.euler = euler.at(samples.stamp_ns)
+        self._refuse_lengths()
+        self.ticks = _read_ticks(self.path, ticks, self.start_ns)
+        self.commands = _merge_commands(found)
+        self._freeze()
+
+    def _require_run(self, joints: Series, ticks: Series) -> None:
+        """Refuse a run without samples or torques."""
+        if len(joints) < LEAST_SAMPLES:
             requirement = (
-                f"a run has two samples or more ({found.idle_states} lie before its"
+                f"a run has two samples or more ({self.idle_states} lie before its"
                 " start)"
             )
-            if fault := self.diagnostics.get("fault"):
+            fault = self.diagnostics.get("fault")
+            if fault:
                 requirement += f"; the simulator reports: {fault}"
             raise refusal(self.path, "joint_states", len(joints), requirement)
         if not len(ticks):
             raise refusal(
                 self.path, "applied_torques", 0, "the run has no recorded torque"
             )
-        shown_samples = truth if len(truth) >= 2 else joints
-        self.start_ns = min(int(shown_samples.stamp_ns[0]), int(ticks.stamp_ns[0]))
-        self.measured = JointSamples.of(joints, self.start_ns)
-        self._truth = (
-            JointSamples.of(truth, self.start_ns) if shown_samples is truth else None
-        )
-        # The attributes that are declared below this function.
-        vars(self).update((self._truth or self.measured)._asdict())
-        self.quaternion = orientation.at(shown_samples.stamp_ns)
-        self.euler = euler.at(shown_samples.stamp_ns)
+
+    def _refuse_lengths(self) -> None:
+        """Refuse quaternions whose length is not 1."""
         with np.errstate(over="ignore"):  # too long is refused just below
             length = np.sqrt(np.einsum("ij,ij->i", self.quaternion, self.quaternion))
         # nan compares False: lost is not wrong
-        wrong = length[np.abs(length - 1.0) > 1e-6]
+        wrong = length[np.abs(length - 1.0) > LENGTH_ROUNDING]
         if len(wrong):
             requirement = "quaternions must have length 1"
             raise refusal(self.path, "orientation", float(wrong[0]), requirement)
-        self.ticks = _read_ticks(self.path, ticks, self.start_ns)
-        self.commands = _merge_commands(found)
-        self._freeze()
 
     time_ns: Integers
     received_ns: Integers
@@ -503,42 +542,37 @@ class Recording(Explained, ReadOnly):
         """
         if self._truth is not None:
             return self._truth
-        of_orientation = self._shown_joints
-        angles = np.abs(
-            np.angle(np.exp(1j * (self.measured.gamma - of_orientation[:, :3])))
+        measured = self.measured
+        turns = np.exp(1j * (measured.gamma - self.exact_gamma))
+        angles_off = np.abs(np.angle(turns)).max(axis=1)
+        # The body rate is the mean of those that the legs give: measured rates with
+        # errors of their own are those of no body, and off the rates of this one.
+        rates = np.hstack([measured.gamma_dot, measured.mu_dot, measured.beta_dot])
+        of_body = self._joints_of_states
+        rates_of_body = np.hstack(
+            [
+                self._columns(of_body.gamma_dot),
+                self._columns(of_body.mu_dot),
+                self._columns(of_body.beta_dot),
+            ]
         )
-        rates = np.hstack(
-            [self.measured.gamma_dot, self.measured.mu_dot, self.measured.beta_dot]
-        )
-        # Those of a body that turns: nine rates of three numbers.
         size = 1.0 + np.abs(rates).max(axis=1, initial=0.0)
-        off = np.maximum(
-            angles.max(axis=1), np.abs(rates - of_orientation[:, 3:]).max(axis=1) / size
-        )
-        is_known = np.isfinite(off)
-        apart = (
-            is_known.any() and np.mean(off[is_known] > MEASURED_APART) > MEASURED_SHARE
-        )
-        return None if apart else self.measured
+        rates_off = np.abs(rates - rates_of_body).max(axis=1) / size
+        off = np.maximum(angles_off, rates_off)
+        off = off[np.isfinite(off)]  # where it is known
+        apart = len(off) > 0 and np.mean(off > MEASURED_APART) > MEASURED_SHARE
+        return None if apart else measured
 
     @cached_property
-    def _shown_joints(self) -> Array:
-        """Angles gamma and all rates, shape (n, 12).
-
-        They go with orientation and body rate.
-        """
-        model = model_of(self.scene)
+    def _joints_of_states(self) -> Joints:
+        """Angles and rates of all joints at the recorded states, (n,) for each leg."""
         with np.errstate(all="ignore"):
-            of_states = kernel.joints(model, tuple(self.states[:, :7].T))
-        rows = (
-            *of_states.gamma,
-            *of_states.gamma_dot,
-            *of_states.mu_dot,
-            *of_states.beta_dot,
-        )
-        return np.stack(
-            [np.broadcast_to(row, self.time_ns.shape) for row in rows], axis=1
-        )
+            return kernel.joints(model_of(self.scene), tuple(self.states.T))
+
+    def _columns(self, of_legs: Sequence[ArrayLike]) -> Array:
+        """Return a quantity of the three legs at the samples, shape (n, 3)."""
+        rows = [np.broadcast_to(row, self.time_ns.shape) for row in of_legs]
+        return np.stack(rows, axis=1)
 
     @cached_property
     def exact_gamma(self) -> Array:
@@ -546,7 +580,7 @@ class Recording(Explained, ReadOnly):
 
         Nan where lost.
         """
-        return freeze(self._shown_joints[:, :3])
+        return freeze(self._columns(self._joints_of_states.gamma))
 
     @cached_property
     def measured_error(self) -> Array:
@@ -588,7 +622,8 @@ class Recording(Explained, ReadOnly):
             ),
             "time [s]": (self.seconds[0], self.seconds[-1]),
             "ticks": (
-                f"{len(ticks.end_ns)} of {ticks.period_ns / 1e9:g} s; {ticks.gaps} gaps"
+                f"{len(ticks.end_ns)} of {ticks.period_ns / NANOSECONDS:g} s; "
+                f"{ticks.gaps} gaps"
             ),
             "commands": len(self.commands),
             "ended": reported.get("fault") or reported.get("phase") or "not reported",
@@ -608,10 +643,14 @@ class Recording(Explained, ReadOnly):
         The shape is (n, 7 or 10). Torques that lag are the efforts; nan where the
         orientation was lost.
         """
-        rates = self.gamma_dot, self.mu_dot, self.beta_dot
-        body_rate = body_rates(Geometry.of(self.scene), self.quaternion, *rates)
         lagged = [self.effort] if self.scene.lags else []
-        return freeze(np.hstack([self.quaternion, body_rate, *lagged]))
+        return freeze(np.hstack([self.quaternion, self._body_rate, *lagged]))
+
+    @cached_property
+    def _body_rate(self) -> Array:
+        """Angular velocity of the star in {E} by all rates [rad/s], shape (n, 3)."""
+        rates = self.gamma_dot, self.mu_dot, self.beta_dot
+        return body_rates(Geometry.of(self.scene), self.quaternion, *rates)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -631,12 +670,11 @@ class Recording(Explained, ReadOnly):
         fault = reported.get("fault", "")
         gaps = self._find_gaps(self.time_ns[has_orientation])
         lost = ticks.end_ns[:-1][ticks.start_ns[1:] != ticks.end_ns[:-1]]
-        inside = [
-            any(begin <= lost_ns < end for begin, end in gaps)
-            for lost_ns in lost.tolist()
-        ]
+        in_gaps = True
+        for lost_ns in lost.tolist():
+            in_gaps = in_gaps and any(begin <= lost_ns < end for begin, end in gaps)
         law = None
-        if all(inside):
+        if in_gaps:  # else torques that are not known would go on
             law = TorqueTable(ticks.start_ns / NANOSECONDS, ticks.torque)
         record = RunRecord(
             status=1 if fault else 0,
@@ -649,7 +687,7 @@ class Recording(Explained, ReadOnly):
             self.scene,
             self.seconds[has_orientation],
             self.quaternion[has_orientation],
-            self.states[has_orientation, 4:7],
+            self._body_rate[has_orientation],
             self.effort[has_orientation],
             run=record,
             joints=joints[has_orientation],
@@ -662,31 +700,30 @@ class Recording(Explained, ReadOnly):
         A span counts also where only some torques are lost. A span of one period is
         none: the torque of its last tick is the effort of its sample.
         """
-        begin, end = time_ns[:-1], time_ns[1:]
-        edges = np.stack([self.ticks.start_ns, self.ticks.end_ns], axis=1).ravel()
-        length = self.ticks.end_ns - self.ticks.start_ns
-        known_ns = np.append(
-            0, np.cumsum(np.stack([length, 0 * length], axis=1).ravel())
-        )[:-1]
-        with_torque_ns = np.diff(np.interp(time_ns, edges, known_ns))
+        begin = time_ns[:-1]
+        end = time_ns[1:]
+        with_torque_ns = self.ticks.known_between(time_ns)
         longer = end - begin > 1.5 * self.period_ns
         lost = longer & (with_torque_ns < (end - begin) - 0.5)
         return list(zip(begin[lost].tolist(), end[lost].tolist(), strict=True))
 
 
+# Columns of a tick at which its torques and a moment begin; the length comes first.
+_TICK_GROUPS = (1, 4)
+
+
 def _read_ticks(path: Path, rows: Series, start_ns: int) -> Ticks:
     """Return the ticks of the rows of their topic; refuse some that overlap."""
-    length_ns = rows.values[:, 0].astype(np.int64)
+    length, _, moment = np.split(rows.values, _TICK_GROUPS, axis=1)
     begin_ns = rows.stamp_ns - start_ns
-    end_ns = begin_ns + length_ns
+    end_ns = begin_ns + length[:, 0].astype(np.int64)
     overlap = rows.stamp_ns[1:][begin_ns[1:] < end_ns[:-1]]
     if len(overlap):
         requirement = (
             f"ticks overlap at stamp {overlap[0]} ns; record one simulator a bag"
         )
         raise refusal(path, topics.TICK_TABLE.key, int(overlap[0]), requirement)
-    moment = rows.values[:, 4:]
-    has_moment = moment.shape[1] == 3 and bool(np.isfinite(moment).all())
+    has_moment = moment.size > 0 and bool(np.isfinite(moment).all())
     return Ticks(begin_ns, end_ns, rows.torque, moment if has_moment else None)
 
 
@@ -709,15 +746,16 @@ def _merge_commands(signals: Signals) -> Series:
 def _finite_rows(signals: Signals, table: TopicTable) -> Series:
     """Return the rows of a topic, which must be finite; moments of ticks may be nan."""
     series = signals.topic_series[table.key]
-    needed = series.values[:, : 4 if table is topics.TICK_TABLE else None]
+    needed = series.values
+    if table is topics.TICK_TABLE:
+        needed, _ = np.split(needed, _TICK_GROUPS[-1:], axis=1)
     finite = np.isfinite(needed)
     if finite.all():
         return series
-    absent = [
-        column.quantity
-        for column, is_finite in zip(series.columns, finite.T, strict=False)
-        if not is_finite.any()
-    ]
+    absent = []
+    for column, is_finite in zip(series.columns, finite.T, strict=False):
+        if not is_finite.any():
+            absent.append(column.quantity)
     if absent and table in (topics.JOINT_STATES, topics.TRUE_JOINT_STATES):
         requirement = (
             "must have these: a whole run has angles and rates of all nine joints, and"
@@ -741,9 +779,8 @@ def _shorten(quantities: list[str]) -> str:
     """
     text = ", ".join(quantities)
     for quantity in dict.fromkeys(name.rpartition("_")[0] for name in quantities):
-        text = text.replace(
-            ", ".join(f"{quantity}_{leg}" for leg in (1, 2, 3)), f"{quantity}_1..3"
-        )
+        legs = ", ".join(f"{quantity}_{leg}" for leg in topics.LEG_NUMBERS)
+        text = text.replace(legs, f"{quantity}_1..3")
     return text
 
 
@@ -806,11 +843,10 @@ def export(
 ) -> list[Path]:
     """Write each table of a recording, as csv or parquet, into a folder.
 
-    Return the paths.
-
-    The folder is made if it is not there; `force` replaces earlier files; the
-    `namespace` is that of `read_signals`. Raises InputError where the recording cannot
-    be read, `out` cannot be written or is not empty, and MissingDependency.
+    Returns the paths. The folder is made if it is not there; `force` replaces earlier
+    files; the `namespace` is that of `read_signals`. Raises InputError where the
+    recording cannot be read, `out` cannot be written or is not empty, and
+    MissingDependency.
     """
     require_free(out, "export", force=force)
     run = read_signals(bag, namespace=namespace)
@@ -819,9 +855,10 @@ def export(
         for (name, series), path in zip(run.tables.items(), paths, strict=True):
             table = run.table(name).reset_index()
             columns = (*topics.TIMES, *series.columns)
-            about = {
+            descriptions = {
                 column.name: {"unit": column.unit, "description": column.text}
                 for column in columns
             }
-            write_table({key: table[key].to_numpy() for key in table}, path, about)
+            arrays = {key: table[key].to_numpy() for key in table}
+            write_table(arrays, path, descriptions)
     return paths

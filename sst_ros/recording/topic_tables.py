@@ -14,7 +14,7 @@ so do the controllers that follow a reference.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from operator import attrgetter
@@ -33,18 +33,20 @@ from sst_ros.recording.bag_reader import (
     Bag,
     Topic,
 )
-from sst_ros.scene.loads import JOINTS, MOMENTS
+from sst_ros.scene.loads import ACTUATED_JOINTS, JOINTS, MOMENTS
 from sst_ros.state import Array, is_idle, nanoseconds
 
-ACTUATED_JOINTS = JOINTS[:3]
+LEG_NUMBERS = (1, 2, 3)
 JOINT_KINDS = ("gamma", "mu", "beta")
 
 Integers: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = list[tuple[int, Sequence[float]]]
-"""Stamps [ns], 0 for none, and the numbers of one message.
+"""The rows of one message: stamps [ns], 0 for none, and numbers; empty for a message
+that is no part of a run."""
 
-None for what is no part of a run.
-"""
+
+ColumnGroup: TypeAlias = tuple[Sequence[str], str, str]
+"""Quantities, the unit of all, and what they are."""
 
 
 class Column(NamedTuple):
@@ -58,15 +60,15 @@ class Column(NamedTuple):
     @property
     def name(self) -> str:
         """Name with the unit, as in "gamma_dot_1_rad_per_s"."""
-        unit = f"_{self.unit.replace('/', '_per_').replace(' ', '_')}"
-        return self.quantity + unit * (self.unit != "1")
+        if self.unit == "1":
+            return self.quantity
+        return f"{self.quantity}_{self.unit.replace('/', '_per_').replace(' ', '_')}"
 
     @property
     def text(self) -> str:
         """What it is, its unit, its topic."""
-        return f"{self.what} [{self.unit}]" + (
-            f", from {self.topic}" if self.topic else ""
-        )
+        text = f"{self.what} [{self.unit}]"
+        return f"{text}, from {self.topic}" if self.topic else text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,8 +117,9 @@ class Series:
     def at(self, stamps_ns: Integers) -> Array:
         """Rows at these stamps, shape (m, columns); nan where there is none."""
         index = places(self.stamp_ns, stamps_ns)
-        rows = np.full((len(stamps_ns), self.values.shape[1]), np.nan)
-        rows[index >= 0] = self.values[index[index >= 0]]
+        has_row = index >= 0
+        rows = np.full((len(stamps_ns), len(self.columns)), np.nan)
+        rows[has_row] = self.values[index[has_row]]
         return rows
 
 
@@ -136,31 +139,46 @@ def sort_rows(
     Their times are pairs of stamp and reception [ns]; their numbers follow each other,
     too. Raises InputError where one recording, at this path, has two rows at a stamp.
     """
-    columns, stamp_pairs = (
-        table.columns,
-        np.frombuffer(times, dtype=np.int64).reshape(-1, 2),
-    )
-    values = np.frombuffer(numbers, dtype=float).reshape(len(stamp_pairs), len(columns))
-    order = np.argsort(stamp_pairs[:, 1], kind="stable")
+    columns = table.columns
+    pairs = np.frombuffer(times, dtype=np.int64).reshape(-1, 2)
+    values = np.frombuffer(numbers, dtype=float).reshape(len(pairs), len(columns))
+    stamps, received = pairs.T
     if table in STAMPED:
-        stamps, order = np.unique(stamp_pairs[:, 0], return_index=True)
-        again = np.delete(np.arange(len(stamp_pairs)), order)
-        # an idle state shows the last sample again
-        if table in (ORIENTATION_TABLE, EULER):
-            first = order[np.searchsorted(stamps, stamp_pairs[again, 0])]
-            again = again[~(values[again] == values[first]).all(axis=1)]
-        if len(again):
-            requirement = (
-                f"stamp {stamp_pairs[again[0], 0]} ns comes twice; record one"
-                " simulator a bag"
-            )
-            raise refusal(path, table.key, len(again), requirement)
-    if not np.array_equal(order, np.arange(len(stamp_pairs))):  # most need no copy
-        stamp_pairs, values = stamp_pairs[order], values[order]
-    if table is TICK_TABLE and np.isnan(values[:, -3:]).all():
-        columns, values = columns[:-3], values[:, :-3]  # no moment was recorded
-    stamps, received = stamp_pairs.T.copy()
+        order = _order_by_stamp(table, stamps, values, path)
+    else:
+        order = np.argsort(received, kind="stable")
+    if np.array_equal(order, np.arange(len(pairs))):  # most are: the values are large
+        stamps = stamps.copy()
+        received = received.copy()
+    else:
+        stamps = stamps[order]
+        received = received[order]
+        values = values[order]
+    if table is TICK_TABLE and np.isnan(values[:, -len(MOMENTS) :]).all():
+        columns = columns[: -len(MOMENTS)]  # no moment was recorded
+        values = values[:, : -len(MOMENTS)]
     return Series(columns, stamps, received, values)
+
+
+def _order_by_stamp(
+    table: TopicTable, stamps: Integers, values: Array, path: Path
+) -> NDArray[np.intp]:
+    """Return the rows in order of their stamps, the first one at each.
+
+    Raises InputError where a stamp comes twice. An idle state shows the last sample
+    again: topics that say nothing of that may repeat a row.
+    """
+    distinct, order = np.unique(stamps, return_index=True)
+    again = np.delete(np.arange(len(stamps)), order)
+    if table in (ORIENTATION_TABLE, EULER):
+        first = order[np.searchsorted(distinct, stamps[again])]
+        again = again[~(values[again] == values[first]).all(axis=1)]
+    if len(again):
+        requirement = (
+            f"stamp {stamps[again[0]]} ns comes twice; record one simulator a bag"
+        )
+        raise refusal(path, table.key, len(again), requirement)
+    return order
 
 
 def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
@@ -184,22 +202,16 @@ def _read_joints(joints: Sequence[str], message: Any) -> Rows | None:
         )
         missing = f"; joints are missing: {', '.join(absent)}" if absent else ""
         raise InvalidMessage(sorted({len(names), *sizes}), requirement + missing)
-    if not absent and 0 not in sizes:
-        position, velocity, effort = (
-            quantity[index].tolist() for quantity in quantities
-        )
+    if not absent and 0 not in sizes:  # nearly all messages: fast
+        rows = [quantity[index].tolist() for quantity in quantities]
     else:
-        position, velocity, effort = (
-            _take_known(quantity, index) for quantity in quantities
-        )
+        rows = [_take_known(quantity, index) for quantity in quantities]
+    position, velocity, effort = rows
     return [(stamp, position + velocity + effort[: len(ACTUATED_JOINTS)])]
 
 
 def _take_known(numbers: Sequence[float], index: Sequence[int]) -> list[float]:
-    """Take numbers by their places, which are negative for what is not there.
-
-    Then nan.
-    """
+    """Take numbers by their places; nan for what is not there, of the place -1."""
     return [float(numbers[k]) if k >= 0 and len(numbers) else np.nan for k in index]
 
 
@@ -217,24 +229,28 @@ def _find_joints(
 
 
 def _parts(vector: str, names: str, *, stamped: bool = True) -> Callable[[Any], Rows]:
-    """Read the parts of a vector or quaternion.
+    """Return what reads a vector or quaternion of a message, by names of components.
 
-    Where `stamped`, of messages with a stamp only.
+    Where `stamped`, messages without a stamp are no part of a run.
     """
     components = attrgetter(*(f"{vector}.{name}" for name in names))
-    return partial(_read_parts, components, stamped)
+    return partial(_read_components, components, stamped)
 
 
 def _read_command(message: Any) -> Rows:
     """Read three torques, which have no stamp."""
-    return [(0, message.data.tolist())] if len(message.data) == 3 else []
+    if len(message.data) != len(LEG_NUMBERS):  # the simulator drops it, too
+        return []
+    return [(0, message.data.tolist())]
 
 
-def _read_parts(
+def _read_components(
     components: Callable[[Any], Sequence[float]], stamped: bool, message: Any
 ) -> Rows:
     stamp = nanoseconds(message.header.stamp)
-    return [(stamp, components(message))] if stamp or not stamped else []
+    if stamped and not stamp:
+        return []
+    return [(stamp, components(message))]
 
 
 def _read_ticks(message: Any) -> Rows:
@@ -248,24 +264,30 @@ def _read_ticks(message: Any) -> Rows:
     names = tuple(message.joint_names) or ACTUATED_JOINTS
     index = _places(ACTUATED_JOINTS, names)
     moments = _places(MOMENTS, names) if set(MOMENTS) <= set(names) else []
-    rows, end = Rows(), start
+    rows = Rows()
+    end = start
     for point in message.points:
         effort = point.effort.tolist()
         if len(effort) != len(names):
             raise InvalidMessage(
                 effort, f"must be a torque for each actuator (stamp {start} ns)"
             )
-        begin, end = end, start + nanoseconds(point.time_from_start)
+        begin = end
+        end = start + nanoseconds(point.time_from_start)
         if end <= begin:
             requirement = f"ticks must have a length; one at stamp {begin} ns has none"
             raise InvalidMessage(end - begin, requirement)
-        moment = [effort[k] for k in moments] or [np.nan] * 3
-        rows.append((begin, [float(end - begin), *(effort[k] for k in index), *moment]))
+        torque = [effort[k] for k in index]
+        moment = [effort[k] for k in moments] or [np.nan] * len(MOMENTS)
+        rows.append((begin, [float(end - begin), *torque, *moment]))
     return rows
 
 
 def _read_stamped_commands(message: Any) -> Rows:
-    if sorted(message.name) != sorted(ACTUATED_JOINTS) or len(message.effort) != 3:
+    """Read three torques by name; the stamp is that of the sample they answer."""
+    if sorted(message.name) != sorted(ACTUATED_JOINTS):
+        return []
+    if len(message.effort) != len(LEG_NUMBERS):
         return []
     index = _places(ACTUATED_JOINTS, tuple(message.name))
     return [(nanoseconds(message.header.stamp), message.effort[index].tolist())]
@@ -273,31 +295,35 @@ def _read_stamped_commands(message: Any) -> Rows:
 
 @lru_cache(maxsize=64)  # all messages of a topic have the same names
 def _places(requested: Sequence[str], names: Sequence[str]) -> list[int]:
-    if absent := [name for name in requested if name not in names]:
+    """Return the place of each joint among the names of a message.
+
+    Raises InvalidMessage where one is missing.
+    """
+    absent = [name for name in requested if name not in names]
+    if absent:
         raise InvalidMessage(list(names), "joints are missing: " + ", ".join(absent))
     return [names.index(name) for name in requested]
 
 
 def _legs(name: str) -> list[str]:
-    return [f"{name}_{leg}" for leg in (1, 2, 3)]
+    """Return the names of a quantity of the three legs."""
+    return [f"{name}_{leg}" for leg in LEG_NUMBERS]
 
 
 def _table(
     key: str,
     message_type: str,
     rows: Callable[[Any], Rows | None],
-    *groups: tuple[Sequence[str], str, str],
+    *groups: ColumnGroup,
     owner: str = SIMULATOR_NODE,
 ) -> TopicTable:
     """Make the table of a topic by its key and owner.
 
-    A part is columns, their unit and what.
+    A group is quantities with their unit and what they are.
     """
-    columns = [
-        Column(name, unit, description, key)
-        for names, unit, description in groups
-        for name in names
-    ]
+    columns: list[Column] = []
+    for names, unit, description in groups:
+        columns += (Column(name, unit, description, key) for name in names)
     return TopicTable(key, message_type, owner, columns=tuple(columns), rows=rows)
 
 
@@ -305,12 +331,20 @@ _JOINT_STATE = "sensor_msgs/msg/JointState"
 _COMMANDED = (_legs("tau"), "N m", "commanded torque")
 _MOMENT_LABEL = "external moment on the star in {B}"
 
+
+def _angles_and_rates(prefix: str = "", truth: str = "") -> Iterator[ColumnGroup]:
+    """Yield the groups of nine angles and nine rates, by kind of joint."""
+    for kind in JOINT_KINDS:
+        yield _legs(f"{prefix}{kind}"), "rad", f"{truth}joint angle {kind}"
+    for kind in JOINT_KINDS:
+        yield _legs(f"{prefix}{kind}_dot"), "rad/s", f"{truth}rate of {kind}"
+
+
 JOINT_STATES = _table(
     "joint_states",
     _JOINT_STATE,
     partial(_read_joints, JOINTS),
-    *((_legs(kind), "rad", f"joint angle {kind}") for kind in JOINT_KINDS),
-    *((_legs(f"{kind}_dot"), "rad/s", f"rate of {kind}") for kind in JOINT_KINDS),
+    *_angles_and_rates(),
     (_legs("tau"), "N m", "torque of the actuator over the step that ends here"),
     owner=NAMESPACE,
 )
@@ -318,14 +352,7 @@ TRUE_JOINT_STATES = _table(
     "true_joint_states",
     _JOINT_STATE,
     partial(_read_joints, JOINTS),
-    *(
-        (_legs(f"true_{kind}"), "rad", f"true joint angle {kind}")
-        for kind in JOINT_KINDS
-    ),
-    *(
-        (_legs(f"true_{kind}_dot"), "rad/s", f"true rate of {kind}")
-        for kind in JOINT_KINDS
-    ),
+    *_angles_and_rates("true_", "true "),
     (_legs("true_tau"), "N m", "torque of the actuator over the step that ends here"),
 )
 ORIENTATION_TABLE = _table(
@@ -369,7 +396,6 @@ TICK_TABLE = _table(
 COMMAND_TABLE = _table(
     "commands",
     "std_msgs/msg/Float64MultiArray",
-    # Others are dropped by the simulator too.
     _read_command,
     _COMMANDED,
 )
@@ -420,8 +446,11 @@ TIMES = (
 """The first columns of every table, whole numbers; all others are doubles."""
 
 PUBLISHED = {
-    one.key
-    for one in (SCENE_TOPIC, ORIENTATION_TABLE, EULER, TICK_TABLE, TRUE_JOINT_STATES)
+    SCENE_TOPIC.key,
+    ORIENTATION_TABLE.key,
+    EULER.key,
+    TICK_TABLE.key,
+    TRUE_JOINT_STATES.key,
 }
 """Topics that a simulator publishes under its own name; others publish its commands."""
 
@@ -481,21 +510,22 @@ def find_absent(
 ) -> dict[str, Problem]:
     """Return why a requested topic of a run is missing, by its key."""
     absent = {}
-    for topic in (
-        candidate for candidate in requested if candidate.key not in run.names
-    ):
+    for topic in requested:
+        if topic.key in run.names:
+            continue
         similar = sorted(name for name in bag.channels if topic.may_be(name))
-        typed = [f"{name} ({bag.channels[name]})" for name in similar]
-        requirement = f"no topic of type {topic.type} ends in {topic.ending}; record it"
-        if any(name in bag.candidates for name in similar):
-            typed, where = (
-                similar,
-                run.node if topic.owner == SIMULATOR_NODE else run.namespace,
-            )
+        if any(name in bag.candidates for name in similar):  # of other runs
+            owner = run.node if topic.owner == SIMULATOR_NODE else run.namespace
+            listed = ", ".join(similar)
             requirement = (
-                f"no such topic is of {where}, whose scene is recorded; record it"
+                f"no such topic is of {owner}, whose scene is recorded; record it"
             )
-        absent[topic.key] = Problem(topic.key, ", ".join(typed) or None, requirement)
+        else:  # of other types
+            listed = ", ".join(f"{name} ({bag.channels[name]})" for name in similar)
+            requirement = (
+                f"no topic of type {topic.type} ends in {topic.ending}; record it"
+            )
+        absent[topic.key] = Problem(topic.key, listed or None, requirement)
     return absent
 
 
@@ -519,35 +549,44 @@ def _choose_namespace(bag: Bag, spaces: Collection[str], namespace: str | None) 
 
 
 def _find_simulators(candidates: Mapping[str, Topic]) -> list[str]:
-    """Full names of the nodes that publish a scene.
+    """Return the full names of the nodes that publish a scene.
 
-    Without one, those with other topics.
+    Without one they are the nodes that publish anything else of a simulator, and
+    without these the nodes that only receive.
     """
     topics: dict[str, set[str]] = {}
     for name, topic in candidates.items():
         if topic.owner == SIMULATOR_NODE:
             topics.setdefault(_parent(name), set()).add(topic.key)
-    publishing = {
-        node: keys & PUBLISHED for node, keys in topics.items() if keys & PUBLISHED
-    }
-    with_scene = {
-        node: keys for node, keys in publishing.items() if SCENE_TOPIC.key in keys
-    }
-    # Another node may publish a text of the name `scene`, but nothing else of a
-    # simulator.
-    sure = [node for node, keys in with_scene.items() if len(keys) > 1]
-    return sure or [*with_scene] or [*publishing] or [*topics]
+    publishing: list[str] = []
+    with_scene: list[str] = []
+    sure: list[str] = []
+    for node, keys in topics.items():
+        published = keys & PUBLISHED
+        if published:
+            publishing.append(node)
+        if SCENE_TOPIC.key in published:
+            with_scene.append(node)
+            # Another node may publish a text of the name `scene`, but nothing else of a
+            # simulator.
+            if len(published) > 1:
+                sure.append(node)
+    return sure or with_scene or publishing or [*topics]
 
 
 def _find_namespaces(candidates: Mapping[str, Topic]) -> set[str]:
-    """Namespaces of runs of which no topic of the simulator's node is recorded."""
-    beside = {_parent(n) for n, topic in candidates.items() if topic.owner == NAMESPACE}
-    below = {
-        _parent(_parent(n))
-        for n, topic in candidates.items()
-        if topic.owner == CONTROLLER_NODE
-    }
-    return beside or below
+    """Return namespaces of runs of which no topic of the simulator's node is recorded.
+
+    They are those of joint states, and without these those of controllers.
+    """
+    of_joints: set[str] = set()
+    of_controllers: set[str] = set()
+    for name, topic in candidates.items():
+        if topic.owner == NAMESPACE:
+            of_joints.add(_parent(name))
+        elif topic.owner == CONTROLLER_NODE:
+            of_controllers.add(_parent(_parent(name)))
+    return of_joints or of_controllers
 
 
 def _find_controllers(

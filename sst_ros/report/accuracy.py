@@ -31,7 +31,7 @@ from sst_ros.integration.point import Drive
 from sst_ros.report.reference_solution import (
     InitialValueProblem,
     ReferenceSolution,
-    Run,
+    SolverRun,
     solve_reference,
 )
 from sst_ros.report.results import data_frame, provenance, publish, records, render
@@ -39,16 +39,15 @@ from sst_ros.report.scene_summary import StepAdvice, step_advice
 from sst_ros.scene import scene as scenes
 from sst_ros.scene.scene import Scene
 from sst_ros.simulation.simulate import simulate
-from sst_ros.state import cached_property
+from sst_ros.state import STAR, cached_property
 
-FIXED, TOLERANCE_KIND = "fixed steps", "tolerance"
+FIXED = "fixed steps"
+TOLERANCE_KIND = "tolerance"
 _STEPS_PER_INTERVAL = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 _TOLERANCES = tuple(10.0**-n for n in range(4, 14))
-TARGET, ERROR_TARGETS = 1e-9, (1e-3, 1e-6, 1e-9, 1e-12)
-"""Orientation errors for which the fastest setting is named [rad].
-
-TARGET is in titles.
-"""
+# orientation errors for which the fastest setting is named [rad]
+ERROR_TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
+TARGET = 1e-9  # the one in titles
 
 # errors are reported if they are so many times the reference's own
 ABOVE_REFERENCE = 100.0
@@ -58,6 +57,11 @@ REFERENCE_ROUNDING = 2e-14  # finer steps are not expected to give less than thi
 LONGEST_RUN_S = 0.4
 # are tried even where they take longer: a busy machine must not empty the grid
 LEAST_SETTINGS = 3
+# A run is timed again for so long [s], from twice to this number of times: the shortest
+# time is that of a core that is free.
+TIMING_S = 0.15
+MOST_TIMINGS = 14
+_SHOWN_REASON = 40  # characters of a failure on the terminal
 
 ERROR_COLUMN = "largest_orientation_rad"
 ERROR_COLUMNS = [
@@ -107,7 +111,7 @@ class WorkPrecision:
 
         So it is with scenes that a controller drives along a reference motion.
         """
-        states = self.reference.states[:, :7]
+        states = self.reference.states[:, STAR]
         return bool(np.abs(states - states[0]).max() < REFERENCE_ROUNDING)
 
     def best(self, target: float) -> Series[Any] | None:
@@ -117,16 +121,17 @@ class WorkPrecision:
         finer setting of its method was tried and every one of them is as good: a coarse
         setting whose errors happen to cancel is no recommendation.
         """
-        good: list[Any] = []
         if self.rests:
             return None
+        good: list[Any] = []
         for _, group in self.rows.groupby(["method", "kind"], sort=False):
-            bad = np.flatnonzero(
-                ~(group[ERROR_COLUMN].astype(float).to_numpy() <= target)
-            )
-            good += group.index[bad[-1] + 1 if len(bad) else 0 : -1].tolist()
-        sorted_rows = self.rows.loc[good].sort_values("wall_min_s", kind="stable")
-        return None if sorted_rows.empty else sorted_rows.iloc[0]
+            errors = group[ERROR_COLUMN].astype(float).to_numpy()
+            bad = np.flatnonzero(~(errors <= target))  # failures have no error
+            first_good = int(bad[-1]) + 1 if len(bad) else 0
+            good += group.index[first_good:-1].tolist()
+        if not good:
+            return None
+        return self.rows.loc[good].sort_values("wall_min_s", kind="stable").iloc[0]
 
     @cached_property
     def fastest(self) -> dict[float, Series[Any]]:
@@ -134,12 +139,12 @@ class WorkPrecision:
 
         Targets below the floor are left out.
         """
-        fastest = {
-            target: self.best(target)
-            for target in ERROR_TARGETS
-            if target >= self.floor
-        }
-        return {target: row for target, row in fastest.items() if row is not None}
+        fastest = {}
+        for target in ERROR_TARGETS:
+            row = self.best(target) if target >= self.floor else None
+            if row is not None:
+                fastest[target] = row
+        return fastest
 
 
 def study_scene(scene: Scene, *, visible: bool = False) -> WorkPrecision:
@@ -148,18 +153,20 @@ def study_scene(scene: Scene, *, visible: bool = False) -> WorkPrecision:
     Progress is `visible` on the terminal. Raises what the problem and its reference do.
     """
     problem = InitialValueProblem(scene)
-    grid, truth = list(list_settings(problem)), solve_reference(problem)
+    grid = list(list_settings(problem))
+    truth = solve_reference(problem)
     refine = partial(_refine, problem=problem, truth=truth)
     # One after another: computing times are those of a core that is free.
-    results = run_many(refine, grid, label=f"{scene.name:<16}" * visible)
-    rows = [row for _, refined in results for row in refined]
-    motion, measured = (
-        simulate(scene, duration=problem.seconds, t_eval=problem.times),
-        None,
-    )
+    label = f"{scene.name:<16}" if visible else ""
+    rows = []
+    for _, refined in run_many(refine, grid, label=label):
+        rows += refined
+    motion = simulate(scene, duration=problem.seconds, t_eval=problem.times)
+    measured = None
     if len(motion) > problem.count:  # else a limit stops it before
         states = np.hstack([motion.quaternion, motion.body_rate])
-        measured = problem.errors(states, truth.states)[1].orientation
+        _, largest = problem.errors(states, truth.states)
+        measured = largest.orientation
     return WorkPrecision(
         scene=scene.name,
         seconds=problem.seconds,
@@ -188,10 +195,10 @@ def proven_error(*arguments: Any, **options: Any) -> str:
         return f"-: {str(refused).splitlines()[0]}"
     if math.isinf(proven.error):
         return f"-: {proven.reason}"
-    until = (
-        f" to {write_down(proven.until, 4)} s: {proven.reason}" if proven.reason else ""
-    )
-    return f"{write_up(proven.error)} rad{until}"
+    bound = f"{write_up(proven.error)} rad"
+    if not proven.reason:
+        return bound
+    return f"{bound} to {write_down(proven.until, 4)} s: {proven.reason}"
 
 
 class SolverSetting(NamedTuple):
@@ -200,7 +207,7 @@ class SolverSetting(NamedTuple):
     method: str
     kind: str  # FIXED or TOLERANCE_KIND
     setting: float  # step [s] or tolerance
-    solve: Callable[[], Run]  # raises SstError, ArithmeticError or ValueError
+    solve: Callable[[], SolverRun]  # raises SstError, ArithmeticError or ValueError
     timed: Callable[[], object]  # does the same work with the least overhead
 
 
@@ -216,9 +223,11 @@ def list_settings(problem: InitialValueProblem) -> Iterator[Iterator[SolverSetti
 def _list_steps(
     problem: InitialValueProblem, method: Method
 ) -> Iterator[SolverSetting]:
-    machine, drive = steps_of(problem.system, method), Drive(tuple(problem.drive))
+    machine = steps_of(problem.system, method)
+    drive = Drive(tuple(problem.drive))
     for steps in _STEPS_PER_INTERVAL:
-        h, start = problem.interval / steps, list(problem.start)
+        h = problem.interval / steps
+        start = list(problem.start)
         timed = partial(machine.fixed, 0.0, h, steps * problem.count, start, drive)
         solve = partial(problem.run_steps, machine, steps)
         yield SolverSetting(method.name, FIXED, h, solve, timed)
@@ -237,18 +246,16 @@ def _refine(
     problem: InitialValueProblem,
     truth: ReferenceSolution,
 ) -> list[dict[str, Any]]:
-    """Go from coarse to fine until a run takes long.
-
-    Also stop where two errors lie below the floor.
-    """
-    rows, below = list[dict[str, Any]](), 0
+    """Go from coarse to fine until a run takes long, or two errors reach the floor."""
+    rows: list[dict[str, Any]] = []
+    below = 0
     floor = max(ABOVE_REFERENCE * truth.own.orientation, REFERENCE_ROUNDING)
     for setting in settings:
-        rows.append(row := _measure(setting, problem, truth))
+        row = _measure(setting, problem, truth)
+        rows.append(row)
         below += row.get(ERROR_COLUMN, math.inf) < floor
-        if (
-            row["wall_min_s"] > LONGEST_RUN_S and len(rows) >= LEAST_SETTINGS
-        ) or below > 1:
+        takes_long = row["wall_min_s"] > LONGEST_RUN_S and len(rows) >= LEAST_SETTINGS
+        if takes_long or below > 1:
             break
     return rows
 
@@ -256,25 +263,29 @@ def _refine(
 def _measure(
     setting: SolverSetting, problem: InitialValueProblem, truth: ReferenceSolution
 ) -> dict[str, Any]:
-    """Run one setting: its row of the grid."""
-    row: dict[str, Any] = dict(
-        zip(("method", "kind", "setting"), setting[:3], strict=True)
-    )
-    row |= {"evaluations": None, "wall_min_s": 0.0, "failure": ""}
+    """Run one setting, and return its row of the grid."""
+    row: dict[str, Any] = {
+        "method": setting.method,
+        "kind": setting.kind,
+        "setting": setting.setting,
+        "evaluations": None,
+        "wall_min_s": 0.0,
+        "failure": "",
+    }
     with np.errstate(all="ignore"):
         try:
-            states, row["evaluations"] = setting.solve()
+            run = setting.solve()
+            row["evaluations"] = run.evaluations
             wall = timeit.timeit(setting.timed, number=1)
             if wall < LONGEST_RUN_S:
-                turns = min(14, max(2, int(0.15 / wall)))
+                turns = min(MOST_TIMINGS, max(2, int(TIMING_S / wall)))
                 wall = min(wall, *timeit.repeat(setting.timed, number=1, repeat=turns))
             row["wall_min_s"] = wall
-            if not np.isfinite(states[:, :7]).all():
+            if not np.isfinite(run.states[:, STAR]).all():
                 raise ArithmeticError("not finite")
-            final, largest = problem.errors(states, truth.states)
-            if not largest.orientation <= USELESS or not math.isfinite(
-                largest.gamma_dot
-            ):
+            final, largest = problem.errors(run.states, truth.states)
+            useful = largest.orientation <= USELESS and math.isfinite(largest.gamma_dot)
+            if not useful:
                 raise ArithmeticError(f"off by {largest.orientation:.1g} rad")
             row |= dict(zip(ERROR_COLUMNS, (*final, *largest), strict=True))
         except (SstError, ArithmeticError, ValueError) as error:
@@ -283,12 +294,10 @@ def _measure(
 
 
 def write_accuracy_report(names: Sequence[str], folder: Path) -> list[WorkPrecision]:
-    """Study scenes one after another.
+    """Study scenes one after another, print each, and write what is finished.
 
-    Print each, and write all finished results into `folder`.
-
-    Files: accuracy.csv, .json, .md, and accuracy_SCENE.png. Raises SstError where a
-    scene is refused or cannot start, or `folder` cannot be written.
+    Files in `folder`: accuracy.csv, .json, .md, and accuracy_SCENE.png. Raises SstError
+    where a scene is refused or cannot start, or `folder` cannot be written.
     """
     studies: list[WorkPrecision] = []
     for each in [scenes.load(name) for name in names]:
@@ -296,15 +305,14 @@ def write_accuracy_report(names: Sequence[str], folder: Path) -> list[WorkPrecis
         studies.append(study)
         print(accuracy_text(study), flush=True)
         rows = [row for result in studies for row in records(result.rows)]
-        files = {
+        files: dict[str, Any] = {
             ".csv": data_frame(rows),
             ".json": {"rows": rows},
             ".md": accuracy_page(studies),
         }
-        drawn = (
-            {} if study.rests else {f"accuracy_{each.name}.png": draw_accuracy(study)}
-        )
-        publish(folder, "accuracy", {**files, **drawn})
+        if not study.rests:
+            files[f"accuracy_{each.name}.png"] = draw_accuracy(study)
+        publish(folder, "accuracy", files)
     return studies
 
 
@@ -319,9 +327,9 @@ def name_fastest(study: WorkPrecision) -> str:
     if best is not None:
         return f"{TARGET:.0e} rad over {study.seconds:g} s: {_setting(best)}."
     least = study.rows[ERROR_COLUMN].astype(float).min()
-    reached = (
-        f"the least error is {least:.0e} rad" if least >= 0.0 else "every one failed"
-    )
+    reached = "every one failed"
+    if math.isfinite(least):
+        reached = f"the least error is {least:.0e} rad"
     return (
         f"No setting that was tried reaches {TARGET:.0e} rad with every finer one;"
         f" {reached}."
@@ -329,9 +337,13 @@ def name_fastest(study: WorkPrecision) -> str:
 
 
 def _setting(row: Series[Any]) -> str:
-    fixed, wall_ms = f"{1e3 * row.setting:.4g} ms steps", 1e3 * row.wall_min_s
-    setting = f"tolerance {row.setting:.0e}" if row.kind == TOLERANCE_KIND else fixed
-    return f"{row.method}, {setting}, {wall_ms:{'.2g' if wall_ms < 99.5 else '.0f'}} ms"
+    """Name a setting, with its computing time."""
+    setting = f"{1e3 * row.setting:.4g} ms steps"
+    if row.kind == TOLERANCE_KIND:
+        setting = f"tolerance {row.setting:.0e}"
+    wall_ms = 1e3 * row.wall_min_s
+    digits = ".2g" if wall_ms < 99.5 else ".0f"  # two, or all before the point
+    return f"{row.method}, {setting}, {wall_ms:{digits}} ms"
 
 
 def accuracy_text(study: WorkPrecision) -> str:
@@ -340,7 +352,8 @@ def accuracy_text(study: WorkPrecision) -> str:
         columns=["scene", "final_gamma_rad", "final_gamma_dot_rad_per_s"]
     )
     columns["failure"] = [
-        f"FAILED: {why[:40]}" if why else "" for why in study.rows.failure
+        f"FAILED: {reason[:_SHOWN_REASON]}" if reason else ""
+        for reason in study.rows.failure
     ]
     grid = columns.to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.1e}")
     return accuracy_page([study], full=False) + f"\n{grid}\n"
@@ -358,7 +371,8 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
 
     The fastest setting for each of ERROR_TARGETS is marked.
     """
-    rows, floor = study.rows, study.floor
+    rows = study.rows
+    floor = study.floor
     figure = Figure(figsize=(10.5, 6.2))
     axes = figure.subplots()
     axes.set(
@@ -368,17 +382,18 @@ def draw_accuracy(study: WorkPrecision) -> Figure:
     drawn = rows[(rows[ERROR_COLUMN] >= floor) & (rows[ERROR_COLUMN] > 0.0)]
     for (name, kind), group in drawn.groupby(["method", "kind"], sort=False):
         colour, marker = MARKERS[name]
-        hollow: Looks = (
-            {} if kind == FIXED else {"markerfacecolor": "white", "linestyle": "--"}
-        )
-        looks: Looks = {"color": colour, "marker": marker, "markersize": 6.5, **hollow}
+        looks: Looks = {"color": colour, "marker": marker, "markersize": 6.5}
+        if kind == TOLERANCE_KIND:
+            looks |= {"markerfacecolor": "white", "linestyle": "--"}
         axes.plot(
             1e3 * group.wall_min_s,
             group[ERROR_COLUMN],
             label=f"{name}, {kind}",
             **looks,
         )
-    errors = drawn[ERROR_COLUMN].astype(float) if len(drawn) else np.array([1e-3, 1.0])
+    errors = np.array([1e-3, 1.0])  # of an empty picture
+    if len(drawn):
+        errors = drawn[ERROR_COLUMN].astype(float).to_numpy()
     low = 10.0 ** math.floor(math.log10(errors.min()) - 0.7)
     axes.set_ylim(low, 10.0 ** math.ceil(math.log10(errors.max()) + 0.01))
     if floor > low:

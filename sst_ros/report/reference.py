@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -34,13 +34,24 @@ from sst_ros.recording.recording import Recording
 from sst_ros.recording.topic_tables import Integers, places
 from sst_ros.scene.scene import Scene
 from sst_ros.scene.torque_profile import SineTorque, Torque
-from sst_ros.state import NANOSECONDS
+from sst_ros.state import NANOSECONDS, QUATERNION
 
-Ticks: TypeAlias = tuple[Integers, Integers, Array]
-"""Ticks: when each begins and ends, from the start of the run on [ns], shape (m,), and
-what is held over it: torques, and a moment on the star in {B} where the scene takes one
-[N m], (m, 3 or 6).
-"""
+
+class HeldTicks(NamedTuple):
+    """m ticks, over each of which torques are held."""
+
+    start_ns: Integers  # from the start of the run on [ns], shape (m,)
+    end_ns: Integers
+    drives: Array
+    """Torques of the actuators, and a moment on the star in {B} where the scene takes
+    one [N m], shape (m, 3 or 6); (m, 0) where torques are those of the scene.
+    """
+
+    def part(self, first: int, end: int) -> HeldTicks:
+        """Return the ticks from the first up to the end."""
+        rows = slice(first, end)
+        return HeldTicks(self.start_ns[rows], self.end_ns[rows], self.drives[rows])
+
 
 LONGEST_TICK_NS = 1_000_000  # longer ticks are divided [ns]
 TICK_TOLERANCE = 1e-13  # largest local error estimate of a step
@@ -71,12 +82,12 @@ class TickStepper(Stepper):
             scene, DOP853.name, TICK_TOLERANCE, budget=budget, limits=False
         )
 
-    def follow(self, ticks: Ticks, start: Array) -> Array:
+    def follow(self, ticks: tuple[Integers, Integers, Array], start: Array) -> Array:
         """Advance through m ticks from a state (quaternion, body rate, lagged torques).
 
-        Returns solution and second solution at the end of each tick, with the work
-        since the start [J], shape (m, 2, 8 or 11); of fewer ticks where no step
-        resolves the next one.
+        The ticks have the parts of `HeldTicks`. Returns solution and second solution at
+        the end of each tick, with the work since the start [J], shape (m, 2, 8 or 11);
+        of fewer ticks where no step resolves the next one.
         """
         ends: list[tuple[list[float], list[float]]] = []
         point = self.begin(start.tolist())
@@ -92,10 +103,16 @@ class TickStepper(Stepper):
         self, point: Point, start_ns: int, end_ns: int, drive: Sequence[float]
     ) -> Point:
         """Advance through one tick; a long one is divided."""
-        torque: Torque = self._sine or (drive[0], drive[1], drive[2])
+        torque: Torque
+        moment: tuple[float, ...] = ()
+        if self._sine is not None:
+            torque = self._sine
+        else:
+            first, second, third, *components = drive
+            torque = (first, second, third)
+            moment = tuple(components)
         acting = self.torque.acting(torque)
-        moment = tuple(drive[3:])
-        count = max(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))
+        count = max(1, -(-(end_ns - start_ns) // LONGEST_TICK_NS))  # rounded up
         begin = start_ns / NANOSECONDS
         length = (end_ns - start_ns) / NANOSECONDS / count
         for index in range(count):
@@ -116,30 +133,40 @@ def begins(recording: Recording) -> bool:
     if recording.diagnostics.get("samples_published") == str(len(recording.time_ns)):
         return True
     start = recording.scene.initial
-    _, gamma, gamma_dot = _true_samples(recording)
-    angle_off = np.abs(gamma[0] - start.gamma)
-    rate_off = np.abs(gamma_dot[0] - start.gamma_dot)
+    samples = _true_samples(recording)
+    angle_off = np.abs(samples.gamma[0] - start.gamma)
+    rate_off = np.abs(samples.gamma_dot[0] - start.gamma_dot)
     return bool(np.nanmax([angle_off, rate_off], initial=0.0) < SAME_START)
 
 
-def _true_samples(run: Recording) -> tuple[Array, Array, Array]:
-    """Quaternions, gamma [rad] and gamma_dot [rad/s] of the true motion.
+class _Samples(NamedTuple):
+    """What is compared of a motion at n samples, nan if unknown."""
 
-    Nan if unknown.
-    """
+    quaternion: Array  # of length 1, shape (n, 4)
+    gamma: Array  # [rad], shape (n, 3)
+    gamma_dot: Array  # [rad/s], shape (n, 3)
+
+    def at(self, rows: Integers | slice) -> _Samples:
+        """Return some of the samples."""
+        return _Samples(*(array[rows] for array in self))
+
+
+def _true_samples(run: Recording) -> _Samples:
+    """Return the samples of the true motion."""
     if run.motion is not None:
-        return run.quaternion, run.gamma, run.gamma_dot
-    return run.quaternion, run.exact_gamma, np.full_like(run.gamma_dot, np.nan)
+        return _Samples(run.quaternion, run.gamma, run.gamma_dot)
+    unknown = np.full_like(run.gamma_dot, np.nan)
+    return _Samples(run.quaternion, run.exact_gamma, unknown)
 
 
 def _first_state(run: Recording) -> Array:
-    """State of the first sample.
+    """Return the state of the first sample.
 
-    Of the scene where the rates of the sample are not known.
+    It is that of the scene where the rates of the sample are not known.
     """
     if run.motion is not None:
         return np.asarray(run.states[0])
-    start = np.array(initial_state(run.scene, Geometry.of(run.scene)))[:7]
+    start = initial_state(run.scene, Geometry.of(run.scene))
     return np.append(start, run.effort[0] if run.scene.lags else [])
 
 
@@ -187,8 +214,8 @@ def integration(recording: Recording) -> Comparison:
         else:
             drives = np.hstack([drives, ticks.moment])
     count = len(drives)
-    held_torques = ticks.start_ns[:count], ticks.end_ns[:count], drives
-    return _compare(recording, None, held_torques, known_start=begins(recording))
+    held = HeldTicks(ticks.start_ns[:count], ticks.end_ns[:count], drives)
+    return _compare(recording, None, held, known_start=begins(recording))
 
 
 def ideal(recording: Recording) -> Comparison | None:
@@ -203,7 +230,7 @@ def ideal(recording: Recording) -> Comparison | None:
     if scene.torque is None or pushed or not begins(recording):
         return None
     no_drives = np.empty((len(time_ns) - 1, 0))
-    intervals = time_ns[:-1], time_ns[1:], no_drives
+    intervals = HeldTicks(time_ns[:-1], time_ns[1:], no_drives)
     return _compare(recording, scene.torque, intervals, known_start=True)
 
 
@@ -223,9 +250,11 @@ class _Distances:
     def enter_start(self) -> None:
         """Enter by what the first sample is off the start that the scene asks for."""
         start = self._run.scene.initial
-        quaternion = self.samples[0]
-        begin = quaternion[:1], np.array([start.gamma]), np.array([start.gamma_dot])
-        self.error[:1] = _measure([values[:1] for values in self.samples], begin)
+        first = self.samples.at(slice(0, 1))
+        requested = _Samples(
+            first.quaternion, np.array([start.gamma]), np.array([start.gamma_dot])
+        )
+        self.error[:1] = _measure(first, requested)
         self.own_error[0] = 0.0
 
     def enter(self, rows: Integers, reached: Array, expected_energy: float) -> None:
@@ -234,13 +263,15 @@ class _Distances:
         `reached` has solution and second solution, shape (n, 2, 8 or 11), each with the
         work [J] since a time at which the energy was `expected_energy` [J].
         """
-        first = _joints(self._model, reached[:, 0])
-        second = _joints(self._model, reached[:, 1])
-        self.error[rows] = _measure([values[rows] for values in self.samples], first)
-        self.own_error[rows] = _measure(second, first)
+        solution, second_solution = np.moveaxis(reached, 1, 0)
+        expected = _joints(self._model, solution)
+        self.error[rows] = _measure(self.samples.at(rows), expected)
+        second = _joints(self._model, second_solution)
+        self.own_error[rows] = _measure(second, expected)
         if self.exact:
             energy = _energy(self._model, self._run.states[rows])
-            self.energy[rows] = energy - expected_energy - reached[:, 0, -1]
+            work = solution[:, -1]
+            self.energy[rows] = energy - expected_energy - work
 
     def last_residual(self, rows: Integers) -> float | None:
         """Return the last energy of some rows that is known [J]."""
@@ -249,91 +280,132 @@ class _Distances:
         return float(finite[-1]) if len(finite) else None
 
 
-def _compare(
-    run: Recording, torque: SineTorque | None, ticks: Ticks, *, known_start: bool
-) -> Comparison:
-    """Propagate a run with a second solution, and compare both at its samples.
+class _Reference:
+    """A reference that goes through the ticks of a run, compared at its samples.
 
-    Under recorded torques, which may have gaps, the reference begins again at a sample
-    after each gap, and after a tick that no step resolves. It goes through at most
-    CHUNK ticks at a time, and to the next gap.
+    Under recorded torques, which may have gaps, it begins again at a sample after each
+    gap, and after a tick that no step resolves. Under continuous torques no sample is
+    on its motion, and it never begins again.
+
+    Attributes:
+        tick: the next tick; all others are done.
+        ready: whether the state at the beginning of that tick is known.
+        unresolved: number of ticks that no step resolved.
+        restarts_ns: samples at which it began again.
+        distances: of the run from the reference.
+
     """
-    start_ns, end_ns, drives = ticks
-    count = len(start_ns)
-    motion = TickStepper(run.scene, torque)
-    model = motion.dynamics.model
-    distances = _Distances(run, model)
-    state = _first_state(run)
-    known_start = known_start and bool(count and np.isfinite(state[0]))
-    if known_start:
-        distances.enter_start()
-    # Ticks at which it can begin again: no sample is on the motion under continuous
-    # torques.
-    sample = places(run.time_ns, start_ns)
-    has_sample = (sample >= 0) & np.isfinite(distances.samples[0][sample, 0])
-    can_restart = torque is None and distances.exact
-    usable = np.flatnonzero(has_sample & can_restart)
-    on_reference = known_start and start_ns[0] == 0  # `state` begins the next tick
-    lost_before = np.append(not on_reference, start_ns[1:] != end_ns[:-1])[:count]
-    stops = np.append(np.flatnonzero(lost_before), count)
-    restarts_ns: list[int] = []
-    bar = Bar("reference", count > CHUNK)
-    k = 0  # the next tick
-    unresolved = 0
-    residual = 0.0  # of the energy, at the last sample where it is known [J]
-    expected_energy = 0.0  # at the beginning of tick k [J]
-    if on_reference:
-        distances.energy[0] = 0.0 if distances.exact else np.nan
-        expected_energy = _energy(model, state[None])[0]
-    while k < count and unresolved < UNRESOLVED:
-        if not on_reference:
-            later = usable[np.searchsorted(usable, k) :]
-            if not len(later):
-                break
-            restart = int(later[0])
-            if lost_before[k : restart + 1].any():
-                restarts_ns.append(int(start_ns[restart]))
-            k = restart
-            state = run.states[sample[k]]
-            distances.energy[sample[k]] = residual
-            expected_energy = _energy(model, state[None])[0] - residual
-        next_stop = int(stops[np.searchsorted(stops, k, side="right")])
-        end = min(next_stop, k + CHUNK)
-        reached = motion.follow((start_ns[k:end], end_ns[k:end], drives[k:end]), state)
-        rows = places(run.time_ns, end_ns[k : k + len(reached)])
+
+    def __init__(
+        self,
+        run: Recording,
+        torque: SineTorque | None,
+        ticks: HeldTicks,
+        *,
+        known_start: bool,
+    ) -> None:
+        count = len(ticks.start_ns)
+        self._run = run
+        self._ticks = ticks
+        self._stepper = TickStepper(run.scene, torque)
+        self._model = self._stepper.dynamics.model
+        self._state = _first_state(run)  # at the beginning of the next tick
+        self.tick = 0
+        self.unresolved = 0
+        self.restarts_ns: list[int] = []
+        self.distances = _Distances(run, self._model)
+        # Of the energy, at the last sample where it is known [J]; a reference that
+        # begins again goes on from it.
+        self._residual = 0.0
+        self._expected_energy = 0.0  # at the beginning of the next tick [J]
+        known_start = known_start and bool(count and np.isfinite(self._state[0]))
+        if known_start:
+            self.distances.enter_start()
+        self.ready = bool(known_start and ticks.start_ns[0] == 0)
+        if self.ready:
+            self.distances.energy[0] = 0.0 if self.distances.exact else np.nan
+            self._expected_energy = self._energy_of(self._state)
+        self._sample = places(run.time_ns, ticks.start_ns)  # of each tick; -1 for none
+        # Ticks at which the reference can begin again.
+        x_of_samples = self.distances.samples.quaternion[self._sample, 0]
+        has_sample = (self._sample >= 0) & np.isfinite(x_of_samples)
+        can_restart = torque is None and self.distances.exact
+        self._usable = np.flatnonzero(has_sample & can_restart)
+        # Ticks before which torques are lost, and the end.
+        has_gap = ticks.start_ns[1:] != ticks.end_ns[:-1]
+        self._lost_before = np.append(not self.ready, has_gap)[:count]
+        self._stops = np.append(np.flatnonzero(self._lost_before), count)
+
+    def restart(self) -> bool:
+        """Begin again at the next sample where that is possible; else return False."""
+        later = self._usable[np.searchsorted(self._usable, self.tick) :]
+        if not len(later):
+            return False
+        restart = int(later[0])
+        if self._lost_before[self.tick : restart + 1].any():
+            self.restarts_ns.append(int(self._ticks.start_ns[restart]))
+        sample = self._sample[restart]
+        self.tick = restart
+        self._state = self._run.states[sample]
+        self.distances.energy[sample] = self._residual
+        self._expected_energy = self._energy_of(self._state) - self._residual
+        return True
+
+    def advance(self) -> None:
+        """Go through at most CHUNK ticks, and to the next gap."""
+        begin = self.tick
+        next_stop = int(self._stops[np.searchsorted(self._stops, begin, side="right")])
+        end = min(next_stop, begin + CHUNK)
+        reached = self._stepper.follow(self._ticks.part(begin, end), self._state)
+        self.tick = begin + len(reached)
+        rows = places(self._run.time_ns, self._ticks.end_ns[begin : self.tick])
         at_sample = rows >= 0
-        distances.enter(rows[at_sample], reached[at_sample], expected_energy)
-        known_residual = distances.last_residual(rows[at_sample])
-        if known_residual is not None:
-            residual = known_residual
-        k += len(reached)
-        on_reference = k == end and k not in stops
-        if on_reference:
-            state = reached[-1, 0, :-1]
-            expected_energy += reached[-1, 0, -1]
-        elif k < end:  # no step resolves this tick
-            unresolved += 1
-            k += 1
-        bar.draw(k / count)
+        self.distances.enter(rows[at_sample], reached[at_sample], self._expected_energy)
+        residual = self.distances.last_residual(rows[at_sample])
+        if residual is not None:
+            self._residual = residual
+        self.ready = self.tick == end and self.tick not in self._stops
+        if self.ready:
+            end_of_tick = reached[-1, 0]  # state and work
+            self._state = end_of_tick[:-1]
+            self._expected_energy += end_of_tick[-1]
+        elif self.tick < end:  # no step resolves this tick
+            self.unresolved += 1
+            self.tick += 1
+
+    def _energy_of(self, state: Array) -> float:
+        return float(_energy(self._model, state[None])[0])
+
+
+def _compare(
+    run: Recording, torque: SineTorque | None, ticks: HeldTicks, *, known_start: bool
+) -> Comparison:
+    """Propagate a run with a second solution, and compare both at its samples."""
+    count = len(ticks.start_ns)
+    reference = _Reference(run, torque, ticks, known_start=known_start)
+    bar = Bar("reference", count > CHUNK)
+    while reference.tick < count and reference.unresolved < UNRESOLVED:
+        if not reference.ready and not reference.restart():
+            break
+        reference.advance()
+        bar.draw(reference.tick / count)
     columns = [*COMPARED_UNITS]
+    distances = reference.distances
     return Comparison(
         error=pd.DataFrame(distances.error, columns=columns),
         own=pd.DataFrame(distances.own_error, columns=columns),
         energy=distances.energy,
-        restarts_ns=tuple(restarts_ns),
-        steps=-(-run.ticks.period_ns // LONGEST_TICK_NS),
+        restarts_ns=tuple(reference.restarts_ns),
+        steps=-(-run.ticks.period_ns // LONGEST_TICK_NS),  # rounded up
     )
 
 
-def _joints(model: kernel.Model, states: Array) -> tuple[Array, Array, Array]:
-    """Return unit quaternions, gamma [rad] and gamma_dot [rad/s] of states.
-
-    States have the shape (n, 7 or more).
-    """
-    quaternion = states[:, :4] / np.linalg.norm(states[:, :4], axis=1)[:, None]
-    joints = kernel.joints(model, tuple(states[:, :7].T))
-    return (
-        quaternion,
+def _joints(model: kernel.Model, states: Array) -> _Samples:
+    """Return unit quaternions and joints of states, shape (n, 7 or more)."""
+    quaternion = states[:, QUATERNION]
+    joints = kernel.joints(model, tuple(states.T))
+    return _Samples(
+        quaternion / np.linalg.norm(quaternion, axis=1)[:, None],
         np.stack(joints.gamma, axis=1),
         np.stack(joints.gamma_dot, axis=1),
     )
@@ -346,16 +418,15 @@ def _energy(model: kernel.Model, states: Array) -> Array:
     return np.asarray(kinetic + kernel.potential_energy(model, columns))
 
 
-def _measure(motion: Sequence[Array], reference: Sequence[Array]) -> Array:
-    """Return distances of quaternions, gamma and gamma_dot, shape (n, 3).
+def _measure(motion: _Samples, reference: _Samples) -> Array:
+    """Return distances of gamma, gamma_dot and orientation, shape (n, 3).
 
     The columns are COMPARED_UNITS.
     """
-    quaternion, gamma, gamma_dot = motion
-    quaternion_0, gamma_0, gamma_dot_0 = reference
     # Recorded angles may count whole turns, computed ones do not.
     turn = 2.0 * np.pi
-    difference = gamma - gamma_0
+    difference = motion.gamma - reference.gamma
     angle = np.abs(difference - turn * np.round(difference / turn)).max(axis=1)
-    rate = np.abs(gamma_dot - gamma_dot_0).max(axis=1)
-    return np.stack([angle, rate, angle_between(quaternion, quaternion_0)], axis=1)
+    rate = np.abs(motion.gamma_dot - reference.gamma_dot).max(axis=1)
+    orientation = angle_between(motion.quaternion, reference.quaternion)
+    return np.stack([angle, rate, orientation], axis=1)

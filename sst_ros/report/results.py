@@ -62,13 +62,13 @@ def data_frame(
     rows: Iterable[Mapping[str, Any]], names: Iterable[str] | None = None
 ) -> DataFrame:
     """Return a DataFrame of rows; what is unknown stays None."""
-    listed, names = list(rows), names and list(names)
-    frame: DataFrame = require("pandas").DataFrame(listed, columns=names)
+    listed = list(rows)
+    columns = None if names is None else list(names)
+    frame: DataFrame = require("pandas").DataFrame(listed, columns=columns)
     for name in frame.columns:  # whole numbers with gaps stay whole numbers
         present = [row[name] for row in listed if row.get(name) is not None]
-        if 0 < len(present) < len(listed) and all(
-            type(value) is int for value in present
-        ):
+        has_gaps = 0 < len(present) < len(listed)
+        if has_gaps and all(type(value) is int for value in present):
             frame[name] = frame[name].astype("Int64")
     return frame
 
@@ -85,15 +85,10 @@ def largest(values: Array) -> float | None:
 
 def markdown(frame: DataFrame) -> str:
     """Return a table of texts as Markdown."""
-    lines = [
-        "| " + " | ".join(map(str, frame.columns)) + " |",
-        "| --- " * len(frame.columns) + "|",
-    ]
     cells = frame.astype(object).where(frame.notna(), "-")
-    lines += [
-        "| " + " | ".join(map(str, row)) + " |" for row in cells.itertuples(index=False)
-    ]
-    return "\n".join(lines)
+    rows = [frame.columns, ["---"] * len(frame.columns)]
+    rows += cells.itertuples(index=False)
+    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in rows)
 
 
 def render(template: str | Path, **values: Any) -> str:
@@ -137,9 +132,9 @@ def provenance(origin: Mapping[str, Any] | None = None) -> str:
     They are those of `made_on`, by default of now.
     """
     origin = origin or made_on()
-    compiler = (
-        f"llvmlite {origin['llvmlite']}" if origin["llvmlite"] else "plain Python"
-    )
+    compiler = "plain Python"
+    if origin["llvmlite"]:
+        compiler = f"llvmlite {origin['llvmlite']}"
     return (
         f"sst_ros {origin['sst_ros']}, Python {origin['python']}, {compiler}, NumPy"
         f" {origin['numpy']}, {origin['processor']}, {origin['processors']} cores,"
@@ -149,6 +144,7 @@ def provenance(origin: Mapping[str, Any] | None = None) -> str:
 
 def made_on() -> dict[str, Any]:
     """Return versions, machine and date of a report."""
+    now = datetime.datetime.now(datetime.timezone.utc)
     return {
         "sst_ros": VERSION,
         "python": platform.python_version(),
@@ -157,9 +153,7 @@ def made_on() -> dict[str, Any]:
         "processor": processor(),
         "platform": platform.platform(),
         "processors": os.cpu_count(),
-        "date": (
-            datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
-        ),
+        "date": now.isoformat(timespec="seconds"),
     }
 
 

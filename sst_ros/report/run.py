@@ -359,13 +359,15 @@ def pair_commands(recording: Recording) -> DataFrame:
     Each has the first tick of its values from its reception on, or from a tick before
     it: the recorder may have received it a little later than the simulator.
     """
-    legs = ["1", "2", "3"]
+    legs = ["leg 1", "leg 2", "leg 3"]
     commands = recording.commands
     ticks = recording.ticks
     limit = recording.scene.torque_limit
-    most = np.inf if limit is None else limit
-    commanded = np.clip(commands.torque, -most, most) + 0.0
-    applied = np.clip(ticks.torque, -most, most) + 0.0
+    if limit is None:
+        limit = np.inf
+    # Zero is added because -0 and 0 are equal, but not in a merge.
+    commanded = np.clip(commands.torque, -limit, limit) + 0.0
+    applied = np.clip(ticks.torque, -limit, limit) + 0.0
     new_commands = _changes(commanded)
     changed_ticks = _changes(applied)
     # When the steps of ticks began, interpolated between the receptions of samples.
@@ -374,13 +376,13 @@ def pair_commands(recording: Recording) -> DataFrame:
     steps_since_ns = np.interp(ticks.end_ns, recording.time_ns, since_ns)
     step_ns = first_ns + steps_since_ns.astype(np.int64)
     earliest_ns = commands.received_ns[new_commands] - ticks.period_ns
-    left = pd.DataFrame(commanded[new_commands], columns=legs)
-    left = left.assign(command=new_commands, ns=earliest_ns)
-    left = left.sort_values("ns", kind="stable")
-    right = pd.DataFrame(applied[changed_ticks], columns=legs)
-    right = right.assign(tick=changed_ticks, ns=step_ns[changed_ticks])
-    right = right.sort_values("ns", kind="stable")
-    pairs = pd.merge_asof(left, right, on="ns", by=legs, direction="forward")
+    sent = pd.DataFrame(commanded[new_commands], columns=legs)
+    sent = sent.assign(command=new_commands, time_ns=earliest_ns)
+    sent = sent.sort_values("time_ns", kind="stable")
+    stepped = pd.DataFrame(applied[changed_ticks], columns=legs)
+    stepped = stepped.assign(tick=changed_ticks, time_ns=step_ns[changed_ticks])
+    stepped = stepped.sort_values("time_ns", kind="stable")
+    pairs = pd.merge_asof(sent, stepped, on="time_ns", by=legs, direction="forward")
     # Commands are in order of reception: the last of those that share a tick is the one
     # it took.
     pairs = pairs.dropna(subset="tick").sort_values("command")

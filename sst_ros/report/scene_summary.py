@@ -32,12 +32,24 @@ from sst_ros.scene.schema import build, drop_idle
 from sst_ros.scene.yaml_document import replace_values
 from sst_ros.simulation.simulate import simulate
 
-COLUMNS = 100
+COLUMNS = 100  # of the text
+LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]
+# error of the orientation that it is for [rad]: the default of `simulate`
+ADVICE_TOLERANCE = 1e-9
+# abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i
+STABLE_GROWTH = 1e-6
+# Shares of the fastest rate: eigenvalues grow from a real part of that size on, smaller
+# ones are rounding of zero.
+GROWING = 1e-9
+ZERO_RATE = 1e-6
+# Steps that are tried, over the inverse of the fastest rate: they differ by 0.2 %.
+TRIED_STEPS = np.geomspace(1e-2, 1e3, 5001)
 
 
 def summary(scene: Scene) -> str:
     """Write the summary of a scene as text."""
-    dynamics, geometry = Dynamics.of(scene), Geometry.of(scene)
+    dynamics = Dynamics.of(scene)
+    geometry = Geometry.of(scene)
     return render(
         "scene.txt",
         scene=scene,
@@ -50,11 +62,19 @@ def summary(scene: Scene) -> str:
         damping=damping_of(scene.stroke) if scene.stroke.at_end == "elastic" else 0.0,
         limits=len(list(limits_of(scene, geometry))),
         advice=step_advice(scene).text,
-        wrap=lambda text, first: textwrap.fill(
-            text, COLUMNS, initial_indent=first, subsequent_indent=" " * len(first),
-            break_on_hyphens=False,
-        ),
-    )  # fmt: skip
+        wrap=_wrap,
+    )
+
+
+def _wrap(text: str, first: str) -> str:
+    """Wrap a text whose first line begins with `first`, and others with blanks."""
+    return textwrap.fill(
+        text,
+        COLUMNS,
+        initial_indent=first,
+        subsequent_indent=" " * len(first),
+        break_on_hyphens=False,
+    )
 
 
 def without(scene: Scene, term: str) -> Scene:
@@ -62,14 +82,18 @@ def without(scene: Scene, term: str) -> Scene:
 
     Gravity goes with the last links that it acts on.
     """
-    key, links = SCENE_TERMS[term], term.endswith("links")
-    removal: dict[str, Any] = {key.partition(".")[0]: [{}] if links else None}
-    for change in (removal if links else {key: None}, removal):
-        # a kind of stops without its own, or gravity
+    key = SCENE_TERMS[term]
+    section = key.partition(".")[0]
+    without_section: dict[str, Any] = {section: None}
+    without_term: dict[str, Any] = {key: None}
+    if term.endswith("links"):  # bodies without anything
+        without_section = without_term = {section: [{}]}
+    for change in (without_term, without_section):
+        # refused: a kind of stops without its own numbers, or gravity on nothing
         with contextlib.suppress(InputError):
             document = replace_values(scene, change)
             return build(Scene, drop_idle(Scene, document), scene.name)
-    return scene.with_values({**removal, "gravity": None})
+    return scene.with_values({**without_section, "gravity": None})
 
 
 def operations(scene: Scene) -> int:
@@ -78,14 +102,11 @@ def operations(scene: Scene) -> int:
 
 
 class Cost(NamedTuple):
-    """What a term of a scene costs.
-
-    These are the operations of the scene, less those of the scene without it.
-    """
+    """What a term of a scene costs."""
 
     name: str
-    adds: int
-    without: int
+    adds: int  # operations of the scene, less those of the scene without it
+    without: int  # these
 
 
 def costs(scene: Scene) -> list[Cost]:
@@ -98,22 +119,12 @@ def costs(scene: Scene) -> list[Cost]:
     return [Cost(term, total - count, count) for term, count in bare.items()]
 
 
-LONGEST_S = 10.0  # the advice is for a run of the scene's duration, but not of more [s]
-# error of the orientation that it is for [rad]: the default of `simulate`
-ADVICE_TOLERANCE = 1e-9
-# abs(R) of a stable step may be so much above 1: dopri5 has 1 + 1e-7 at 0.1 i
-STABLE_GROWTH = 1e-6
-
-
 class StepAdvice(NamedTuple):
-    """A recommendation in words, and what `auto` takes.
+    """A recommendation, which is what `auto` takes."""
 
-    That is a method and a mean step [s], nan for none.
-    """
-
-    text: str
+    text: str  # in words
     method: str = ""
-    step: float = math.nan
+    step: float = math.nan  # on average [s]; nan for none
 
 
 def step_advice(scene: Scene) -> StepAdvice:
@@ -128,11 +139,9 @@ def step_advice(scene: Scene) -> StepAdvice:
         f"for an error of {ADVICE_TOLERANCE:g} rad over {seconds:g} s: {motion.method}"
     )
     text += f"; its steps have {motion.step:.2g} s on average"
-    limit, fastest = (
-        largest_stable_step(DORMAND_PRINCE, rates),
-        float(np.abs(rates).max()),
-    )
+    fastest = float(np.abs(rates).max())
     text += f". The fastest rate at the start is {fastest:.3g} 1/s"
+    limit = largest_stable_step(DORMAND_PRINCE, rates)
     if math.isfinite(limit):
         text += (
             f": steps of {DORMAND_PRINCE.name} above {limit:.2g} s would be unstable"
@@ -151,11 +160,12 @@ def eigenvalues(
     start, and of the torque that acts there [N m], shape (3,).
     """
     ode = recent_ode(Dynamics.of(scene))
-    y = initial_state(scene, Geometry.of(scene)) if state is None else tuple(state)
-    lagged, moment = (0.0,) * (len(ode.state) - len(y)), (0.0,) * (len(ode.drive) - 3)
-    return np.asarray(
-        ode.eigenvalues(0.0, (*y, *lagged), (*torque, *moment)), dtype=complex
-    )
+    if state is None:
+        state = initial_state(scene, Geometry.of(scene))
+    lagged = (0.0,) * (len(ode.state) - len(state))
+    moment = (0.0,) * (len(ode.drive) - len(torque))
+    rates = ode.eigenvalues(0.0, (*state, *lagged), (*torque, *moment))
+    return np.asarray(rates, dtype=complex)
 
 
 def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
@@ -165,17 +175,17 @@ def largest_stable_step(method: Method, eigenvalues: ArrayLike) -> float:
     """
     values = np.asarray(eigenvalues, dtype=complex)
     fastest = float(np.abs(values).max(initial=0.0))
-    values = values[(values.real <= 1e-9 * fastest) & (np.abs(values) > 1e-6 * fastest)]
+    bounded = values.real <= GROWING * fastest
+    values = values[bounded & (np.abs(values) > ZERO_RATE * fastest)]
     if not len(values):
         return math.inf
-    steps = np.geomspace(1e-2, 1e3, 5001) / np.abs(values).max()
-    stable = (
-        np.abs(stability_function(method, np.outer(steps, values))).max(axis=1)
-        < 1 + STABLE_GROWTH
-    )
-    return (
-        math.inf if stable.all() else float(steps[max(int(np.argmin(stable)) - 1, 0)])
-    )
+    steps = TRIED_STEPS / np.abs(values).max()
+    growth = np.abs(stability_function(method, np.outer(steps, values)))
+    stable = growth.max(axis=1) < 1 + STABLE_GROWTH
+    if stable.all():
+        return math.inf
+    first_unstable = int(np.argmin(stable))
+    return float(steps[max(first_unstable - 1, 0)])
 
 
 def stability_function(
@@ -197,4 +207,5 @@ def stability_function(
 
 
 def _combine(weights: tuple[float, ...], stages: list[Any]) -> Any:
+    """Return the weighted sum of stages; the last weights may have no stage yet."""
     return sum((w * k for w, k in zip(weights, stages, strict=False) if w), 0.0)

@@ -26,7 +26,7 @@ from pandas import DataFrame
 from scipy.spatial.transform import Rotation
 
 from sst_ros.dynamics import kernel
-from sst_ros.errors import SstError, refuse_unless, suggestion
+from sst_ros.errors import Check, SstError, refuse_unless, suggestion
 from sst_ros.figures import BLUE, MARKERS, VERMILION, legend, note, styled
 from sst_ros.integration.many_runs import run_many
 from sst_ros.integration.methods import METHODS
@@ -53,10 +53,16 @@ from sst_ros.simulation.trajectory import Trajectory
 from sst_ros.state import Array
 
 EIGENVALUE_INSTANTS = 50  # at which the motion is linearised
-FINER, FACTOR, PASSING_ROUNDING = 1e-2, 10.0, 1e-13
-"""A run is checked by one for FINER times the tolerance. Its estimate holds if the true
-error is at most FACTOR times as large, or PASSING_ROUNDING [rad].
-"""
+FINER = 1e-2  # share of the tolerance by which a second run checks the first one
+# The estimate of a run holds if the true error is at most so many times as large, or
+# rounding [rad].
+FACTOR = 10.0
+PASSING_ROUNDING = 1e-13
+LARGER = 10.0  # factor of torques and rates
+STIFFER = 100.0  # of stiffness and friction
+# margin of the workspace [rad] below which a limit is passed, and not met to rounding
+PASSED_MARGIN = -1e-9
+TURN_BISECTIONS = 40  # of the turns between two of TURNS: to rounding
 # of the star about each axis, up to pi: limits and singularities lie between them
 TURNS = 181
 SPIN = 1.0  # angular velocity with which a run goes from a limit into it [rad/s]
@@ -64,6 +70,13 @@ BESIDE = 1e-3  # angle between a singular pose and the start beside it [rad]
 
 Change: TypeAlias = "Callable[[Scene, Trajectory], Scene | str]"
 """Makes another scene of one and its motion, or gives the reason why there is none."""
+
+
+class ChangedRun(NamedTuple):
+    """A row of the report."""
+
+    description: str  # what differs from the scene
+    change: Change
 
 
 class StabilityReport(NamedTuple):
@@ -102,12 +115,11 @@ def write_stability_report(
     report = examine_stability(scene, only, visible=True)
     page = stability_page(report)
     print(page)
-    steps, runs = records(report.steps.replace(math.inf, None)), records(report.runs)
     document = {
         "scene": report.scene,
         "advice": report.advice,
-        "steps": steps,
-        "runs": runs,
+        "steps": records(report.steps.replace(math.inf, None)),
+        "runs": records(report.runs),
     }
     files = {
         ".csv": report.runs,
@@ -122,21 +134,13 @@ def write_stability_report(
 def examine_stability(
     scene: Scene, only: Sequence[str] = (), *, visible: bool = False
 ) -> StabilityReport:
-    """Find the stable steps along the motion of a scene.
-
-    Also run the scene with other numbers.
-    """
+    """Find the stable steps along a motion, and run its scene with other numbers."""
     requirement = f"must be one of {', '.join(CHANGED_RUNS)}"
-    wrong = (
-        (
-            "--only",
-            name,
-            name in CHANGED_RUNS,
-            requirement + suggestion(name, CHANGED_RUNS),
-        )
-        for name in only
-    )
-    refuse_unless("report stability", *wrong)
+    checks: list[Check] = []
+    for name in only:
+        hint = suggestion(name, CHANGED_RUNS)
+        checks.append(("--only", name, name in CHANGED_RUNS, requirement + hint))
+    refuse_unless("report stability", *checks)
     chosen = [name for name in CHANGED_RUNS if name in only or not only]
     seconds = min(scene.duration or WHOLE_RUN_S, advised.LONGEST_S)
     began = time.perf_counter()
@@ -147,45 +151,45 @@ def examine_stability(
             f"{len(chosen)} runs of {seconds:g} s, each at two tolerances: about"
             f" {about:.0f} s"
         )
-    steps = []
-    instants = motion.at(np.linspace(motion.t[0], motion.t[-1], EIGENVALUE_INSTANTS))
-    states = np.hstack([instants.quaternion, instants.body_rate, instants.torque])
-    for t, state in zip(instants.t.tolist(), states.tolist(), strict=True):
-        values = advised.eigenvalues(
-            scene, state if scene.lags else state[:7], state[7:]
-        )
-        fastest = {
-            "decay": max(0.0, -values.real.min()),
-            "oscillation": abs(values.imag).max(),
-        }
-        longest = {
-            name: advised.largest_stable_step(method, values)
-            for name, method in METHODS.items()
-        }
-        steps.append({"t_s": t, **fastest, **longest})
+    steps = _stable_steps(scene, motion)
 
     def run(name: str) -> dict[str, Any]:
-        description, change = CHANGED_RUNS[name]
-        return {
-            "name": name,
-            "change": description,
-            **_run(change(scene, motion), seconds),
-        }
+        row = CHANGED_RUNS[name]
+        outcome = _run(row.change(scene, motion), seconds)
+        return {"name": name, "change": row.description, **outcome}
 
     # One after another: computing times are those of a core that is free.
-    runs = [
-        row for _, row in run_many(run, chosen, label=f"{scene.name:<16}" * visible)
-    ]
+    label = f"{scene.name:<16}" if visible else ""
+    runs = [row for _, row in run_many(run, chosen, label=label)]
     advice = advised.step_advice(scene).text
     return StabilityReport(scene.name, data_frame(steps), advice, data_frame(runs))
 
 
-def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
-    """Run a scene at two tolerances, and say how it ended.
+def _stable_steps(scene: Scene, motion: Trajectory) -> list[dict[str, Any]]:
+    """Return rates and longest stable steps along a motion, see `StabilityReport`."""
+    steps = []
+    instants = motion.at(np.linspace(motion.t[0], motion.t[-1], EIGENVALUE_INSTANTS))
+    states = np.hstack([instants.quaternion, instants.body_rate])
+    if scene.lags:
+        states = np.hstack([states, instants.torque])
+    for t, state, torque in zip(
+        instants.t.tolist(), states.tolist(), instants.torque.tolist(), strict=True
+    ):
+        values = advised.eigenvalues(scene, state, torque)
+        row = {
+            "t_s": t,
+            "decay": max(0.0, -values.real.min()),
+            "oscillation": abs(values.imag).max(),
+        }
+        for name, method in METHODS.items():
+            row[name] = advised.largest_stable_step(method, values)
+        steps.append(row)
+    return steps
 
-    These are the last columns of a row.
-    """
-    row = {
+
+def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
+    """Run a scene at two tolerances: how it ended, as the last columns of a row."""
+    row: dict[str, Any] = {
         "passed": None,
         "result": changed,
         "method": "",
@@ -195,55 +199,60 @@ def _run(changed: Scene | str, seconds: float) -> dict[str, Any]:
     began = time.perf_counter()
     try:
         if isinstance(changed, Scene):
-            with np.errstate(all="ignore"):
-                run, fine = (
-                    simulate(changed, duration=seconds, tolerance=tolerance)
-                    for tolerance in (
-                        advised.ADVICE_TOLERANCE,
-                        FINER * advised.ADVICE_TOLERANCE,
-                    )
-                )
-            at, estimate = min(float(run.t[-1]), float(fine.t[-1])), run.error_estimate
-            error = float(
-                angle_between(*(motion.at(at).quaternion[0] for motion in (run, fine)))
-            )
-            # A run that ends where it starts has no estimate.
-            holds = run.status < 0 or bool(
-                error <= np.fmax(FACTOR * estimate, PASSING_ROUNDING)
-            )
-            same = run.status == fine.status
-            result = run.message if same else f"{run.message}; finer: {fine.message}"
-            row |= {"passed": same and holds, "result": result, "method": run.method}
-            row |= {"error": error, "estimate": estimate}
-    except SstError as fault:
-        row |= {
-            "passed": True,
-            "result": f"{type(fault).__name__}: {str(fault).splitlines()[0]}",
-        }
+            row |= _run_twice(changed, seconds)
+    except SstError as fault:  # it names the reason
+        reason = str(fault).splitlines()[0]
+        row |= {"passed": True, "result": f"{type(fault).__name__}: {reason}"}
     return row | {"wall_s": time.perf_counter() - began}
+
+
+def _run_twice(scene: Scene, seconds: float) -> dict[str, Any]:
+    """Compare a run with a finer one."""
+    tolerance = advised.ADVICE_TOLERANCE
+    with np.errstate(all="ignore"):
+        run = simulate(scene, duration=seconds, tolerance=tolerance)
+        fine = simulate(scene, duration=seconds, tolerance=FINER * tolerance)
+    end = min(float(run.t[-1]), float(fine.t[-1]))
+    apart = angle_between(run.at(end).quaternion[0], fine.at(end).quaternion[0])
+    error = float(apart)
+    # A run that ends where it starts has no estimate.
+    allowed_error = np.fmax(FACTOR * run.error_estimate, PASSING_ROUNDING)
+    holds = run.status < 0 or bool(error <= allowed_error)
+    same_end = run.status == fine.status
+    result = run.message
+    if not same_end:
+        result = f"{run.message}; finer: {fine.message}"
+    return {
+        "passed": same_end and holds,
+        "result": result,
+        "method": run.method,
+        "error": error,
+        "estimate": run.error_estimate,
+    }
 
 
 def _scale(factor: float, keys: str, absent: str) -> Change:
     """Multiply all numbers of a scene whose key is `keys`, a regular expression."""
 
     def change(scene: Scene, _: Trajectory) -> Scene | str:
-        numbers = {key_of(place): value for place, value in leaves(scene).items()}
-        scaled = {
-            key: factor * x for key, x in numbers.items() if re.fullmatch(keys, key)
-        }
+        scaled = {}
+        for place, value in leaves(scene).items():
+            key = key_of(place)
+            if re.fullmatch(keys, key):
+                scaled[key] = factor * value
         return scene.with_values(scaled) if scaled else f"the scene has no {absent}"
 
     return change
 
 
 def _faster(scene: Scene, motion: Trajectory) -> Scene | str:
-    """Start with ten times the rates, or ten times those that it reaches from rest."""
+    """Start with LARGER rates: than those given, or those that it reaches from rest."""
     rates = np.array(scene.initial.gamma_dot)
     if not rates.any():
         rates = np.abs(motion.gamma_dot).max(axis=0)
     if not rates.any():
         return "nothing moves"
-    return scene.with_values({"initial.gamma_dot": 10.0 * rates})
+    return scene.with_values({"initial.gamma_dot": LARGER * rates})
 
 
 def _turn_to(*names: str, spin: float = 0.0, before: float = 0.0) -> Change:
@@ -254,15 +263,15 @@ def _turn_to(*names: str, spin: float = 0.0, before: float = 0.0) -> Change:
 
     def change(scene: Scene, motion: Trajectory) -> Scene | str:
         zeros = [_first_zeros(scene, motion, name, before) for name in names]
-        axes, angles, poses = (
-            np.concatenate(columns) for columns in zip(*zeros, strict=True)
-        )
+        axes, angles, poses = map(np.concatenate, zip(*zeros, strict=True))
         if not len(angles):
             return "no turn of the star meets it"
         # Where a limit is met as well, or before, that one ends the run.
-        geometry, beyond = Geometry.of(scene), _measure(scene, poses).margin < -1e-9
+        geometry = Geometry.of(scene)
+        beyond = _measure(scene, poses).margin < PASSED_MARGIN
         nearest = int(np.lexsort((angles, beyond))[0])
-        rotation, rate = poses[nearest], poses[nearest].T @ (spin * axes[nearest])
+        rotation = poses[nearest]
+        rate = rotation.T @ (spin * axes[nearest])
         quaternion = quaternion_of(rotation)
         state = (*quaternion.tolist(), *rate.tolist())
         rates = np.array(kernel.joints(kernel.model_of(scene), state).gamma_dot)
@@ -282,15 +291,14 @@ def _first_zeros(
     there, or by an angle `before` it.
     """
     start = rotation_matrix(motion.quaternion[0])
-    axes = np.array(
-        [u for u in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(u)]
-    )
+    # towards the corners, edges and faces of a cube
+    corners = itertools.product((-1.0, 0.0, 1.0), repeat=3)
+    axes = np.array([axis for axis in corners if any(axis)])
     axes /= np.linalg.norm(axes, axis=1)[:, None]
 
     def turn(axes: Array, angles: Array) -> Array:
-        return np.asarray(
-            Rotation.from_rotvec(angles[:, None] * axes).as_matrix() @ start
-        )
+        turns = Rotation.from_rotvec(angles[:, None] * axes)
+        return np.asarray(turns.as_matrix() @ start)
 
     def values(axes: Array, angles: Array) -> Array:
         return np.asarray(getattr(_measure(scene, turn(axes, angles)), name))
@@ -300,48 +308,54 @@ def _first_zeros(
     sign = np.sign(every[0])
     beyond = sign * every.reshape(len(axes), TURNS) <= 0.0
     meets = beyond.any(axis=1) & ~beyond[:, 0]
-    axes, first = axes[meets], beyond.argmax(axis=1)[meets]
+    axes = axes[meets]
+    first = beyond.argmax(axis=1)[meets]
     if not len(axes):  # SciPy before 1.16 makes no rotations of none
         return axes, np.zeros(0), np.zeros((0, 3, 3))
-    low, high = angles[first - 1], angles[first]
-    for _ in range(40):
+    low = angles[first - 1]
+    high = angles[first]
+    for _ in range(TURN_BISECTIONS):
         middle = 0.5 * (low + high)
         inside = sign * values(axes, middle) > 0.0
-        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+        low = np.where(inside, middle, low)
+        high = np.where(inside, high, middle)
     return axes, low, turn(axes, np.maximum(low - before, 0.0))
 
 
 def _measure(scene: Scene, rotation: Array) -> workspace.Measures:
+    """Return the measures of the workspace at orientations, shape (n, 3, 3)."""
     geometry = Geometry.of(scene)
     return workspace.measures(
         geometry, kinematics.inverse(geometry, rotation)[0], rotation
     )
 
 
-CHANGED_RUNS: dict[str, tuple[str, Change]] = {
-    "as-it-is": ("nothing", lambda scene, _: scene),
-    "torque": (
+CHANGED_RUNS = {
+    "as-it-is": ChangedRun("nothing", lambda scene, _: scene),
+    "torque": ChangedRun(
         "ten times the torque",
-        _scale(10.0, r"torque\.amplitude.*", "torques of its own"),
+        _scale(LARGER, r"torque\.amplitude.*", "torques of its own"),
     ),
-    "rates": ("ten times the rates at the start", _faster),
-    "stiffness": (
+    "rates": ChangedRun("ten times the rates at the start", _faster),
+    "stiffness": ChangedRun(
         "a hundred times the stiffness",
-        _scale(100.0, r".*\.stiffness", "springs and no elastic stops"),
+        _scale(STIFFER, r".*\.stiffness", "springs and no elastic stops"),
     ),
-    "friction": (
+    "friction": ChangedRun(
         "a hundred times the friction",
-        _scale(100.0, r"friction\..*\.(viscous|coulomb|static)", "friction"),
+        _scale(STIFFER, r"friction\..*\.(viscous|coulomb|static)", "friction"),
     ),
-    "stroke": ("from an end of the stroke into it", _turn_to("stroke", spin=SPIN)),
-    "edge": ("from beta = 0 into it", _turn_to("edge", spin=SPIN)),
-    "reach": ("from the largest beta into it", _turn_to("reach", spin=SPIN)),
-    "singularity": (
+    "stroke": ChangedRun(
+        "from an end of the stroke into it", _turn_to("stroke", spin=SPIN)
+    ),
+    "edge": ChangedRun("from beta = 0 into it", _turn_to("edge", spin=SPIN)),
+    "reach": ChangedRun("from the largest beta into it", _turn_to("reach", spin=SPIN)),
+    "singularity": ChangedRun(
         f"from {BESIDE:g} rad beside the nearest singularity",
         _turn_to("det_j1", "det_j2", before=BESIDE),
     ),
 }
-"""Rows by the name that `--only` takes: what differs from the scene, and its maker."""
+"""Rows by the name that `--only` takes."""
 
 
 def stability_page(report: StabilityReport) -> str:
@@ -362,12 +376,12 @@ def draw_stability(report: StabilityReport) -> Figure:
     left, right = figure.subplots(1, 2)
     steps = report.steps.set_index("t_s").replace([math.inf, 0.0], math.nan)
     looks = {"logy": True, "linewidth": 1.8, "xlabel": "time t [s]"}
-    rates, label = (
-        steps[["decay", "oscillation"]],
-        "fastest rate of the eigenvalues [1/s]",
-    )
-    rates.plot(
-        ax=left, ylabel=label, color=[BLUE, VERMILION], style=["-", "--"], **looks
+    steps[["decay", "oscillation"]].plot(
+        ax=left,
+        ylabel="fastest rate of the eigenvalues [1/s]",
+        color=[BLUE, VERMILION],
+        style=["-", "--"],
+        **looks,
     )
     limited = [name for name in METHODS if steps[name].notna().any()]
     colours = [MARKERS[name][0] for name in limited]

@@ -22,7 +22,13 @@ from sst_ros.mechanism.geometry import (
 from sst_ros.plot import pictures
 from sst_ros.recording import recording
 from sst_ros.recording.recording import Recording
-from sst_ros.recording.topic_tables import REFERENCE_TABLE, TRACKING_ERROR, places
+from sst_ros.recording.topic_tables import (
+    REFERENCE_TABLE,
+    TRACKING_ERROR,
+    Integers,
+    Series,
+    places,
+)
 from sst_ros.report.results import largest, publish, render
 from sst_ros.state import NANOSECONDS, Array, cached_property
 
@@ -48,13 +54,12 @@ class TrackedRun:
 
         How often a torque was limited is in the last diagnostics of the controller.
         """
-        counts = (
-            status.values.get("samples_limited", "")
-            for status in reversed(
-                self.recording.signals.statuses_of("control", REFERENCE_TABLE.key)
-            )
-        )
-        limited = next((int(count) for count in counts if count.isdecimal()), None)
+        signals = self.recording.signals
+        limited = None
+        for status in signals.statuses_of("control", REFERENCE_TABLE.key):
+            count = status.values.get("samples_limited", "")
+            if count.isdecimal():
+                limited = int(count)  # the last one that was reported
         return TrackingMetrics(self.track, limited)
 
     @cached_property
@@ -64,15 +69,17 @@ class TrackedRun:
         The assembly of the run is followed along the reference; nan where it is not
         known.
         """
-        run, gamma = self.recording, self.track.gamma
-        geometry, measured = Geometry.of(run.scene), run.quaternion[self.rows]
-        if np.isfinite(measured[0]).all():
+        run = self.recording
+        gamma = self.track.gamma
+        geometry = Geometry.of(run.scene)
+        recorded = run.quaternion[self.rows]
+        if np.isfinite(recorded[0]).all():
             with suppress(SingularConfiguration):
-                first = rotation_matrix(measured[0])
+                first = rotation_matrix(recorded[0])
                 begin = run.exact_gamma[self.rows[0]]
                 start = continuation.advance(geometry, first, begin, gamma[0])
                 expected, _ = continuation.follow(geometry, gamma, start)
-                return angle_between(quaternion_of(expected), measured)
+                return angle_between(quaternion_of(expected), recorded)
         return np.full(len(gamma), np.nan)
 
 
@@ -84,7 +91,8 @@ def read_tracking(path: Path) -> TrackedRun:
     """
     run = recording.read(path)
     missing = run.signals.absent
-    if absent := [missing[key] for key in TRACKING_TOPICS if key in missing]:
+    absent = [missing[key] for key in TRACKING_TOPICS if key in missing]
+    if absent:
         raise InputError(str(path), absent)
     tracked = of(run)
     if tracked is None:
@@ -99,28 +107,31 @@ def of(run: Recording) -> TrackedRun | None:
 
     None where fewer than two samples have one.
     """
-    series = [run.signals.topic_series[key] for key in TRACKING_TOPICS]
+    reference, error = (run.signals.topic_series[key] for key in TRACKING_TOPICS)
     stamps = run.time_ns + run.start_ns
-    series_rows = [places(topic.stamp_ns, stamps) for topic in series]
-    rows = np.flatnonzero(np.min(series_rows, axis=0) >= 0)
+    in_reference = places(reference.stamp_ns, stamps)
+    in_error = places(error.stamp_ns, stamps)
+    rows = np.flatnonzero((in_reference >= 0) & (in_error >= 0))
     if len(rows) < 2:
         return None
-    reference, error = (
-        topic.values[row[rows]] for topic, row in zip(series, series_rows, strict=True)
-    )
-    feedforward = reference[:, 6:]
-    feedback = error[:, 6:]
+    # In the order of the columns of REFERENCE_TABLE and TRACKING_ERROR.
+    gamma, gamma_dot, feedforward = _split(reference, in_reference[rows])
+    gamma_error, _, feedback = _split(error, in_error[rows])
     times = run.time_ns[rows]
     # The torque of the tick that begins at a sample; what was lost is what was
     # requested. A sample after the last tick has none.
     tick = places(run.ticks.start_ns, times)
-    torque = np.where(
-        (tick >= 0)[:, None], run.ticks.torque[tick], feedforward + feedback
-    )
+    has_tick = (tick >= 0)[:, None]
+    torque = np.where(has_tick, run.ticks.torque[tick], feedforward + feedback)
     torque[times >= run.ticks.end_ns[-1]] = 0.0
     seconds = times[:, None] / NANOSECONDS
-    columns = seconds, reference[:, :6], error[:, :3], feedforward, feedback, torque
+    columns = seconds, gamma, gamma_dot, gamma_error, feedforward, feedback, torque
     return TrackedRun(run, track_of(np.hstack(columns)), rows)
+
+
+def _split(series: Series, rows: Integers) -> list[Array]:
+    """Return angles, rates and torques of some rows, each shape (n, 3)."""
+    return np.split(series.values[rows], 3, axis=1)
 
 
 def write_tracking_report(bag: Path, folder: Path) -> str:
@@ -131,8 +142,12 @@ def write_tracking_report(bag: Path, folder: Path) -> str:
     """
     tracked = read_tracking(bag)
     title = f"Tracking of {tracked.recording.scene.name}, from {bag}"
-    given = {"found": tracked.metrics, "turned": largest(tracked.orientation_error)}
-    text = render("tracking.txt", title=title, **given)
+    text = render(
+        "tracking.txt",
+        title=title,
+        found=tracked.metrics,
+        turned=largest(tracked.orientation_error),
+    )
     publish(folder, "report", {"tracking.txt": text})
     pictures.draw_run(tracked.recording.signals, folder, TRACKING_DRAWN, ["png"])
     return text

@@ -45,16 +45,16 @@ def make_parser(command: str) -> argparse.ArgumentParser:
     )
     defaults = NODE_COMMANDS[command][1]()
     for name, spec in _specs_of(command).items():
-        value = getattr(defaults, name, False)
-        default_text = json.dumps(value) if isinstance(value, (bool, tuple)) else value
-        text = f"{spec.doc}; {spec.describe()}; default: {default_text}".replace(
-            "%", "%%"
-        )
-        implied_value = (
-            "true" if spec.kind == "flag" else ""
-        )  # of an option without a value
+        default = getattr(defaults, name, False)
+        if isinstance(default, (bool, tuple)):
+            default = json.dumps(default)
+        text = f"{spec.doc}; {spec.describe()}; default: {default}"
         parser.add_argument(
-            _option(name), nargs="?", const=implied_value, metavar="VALUE", help=text
+            _option(name),
+            nargs="?",
+            const="true" if spec.kind == "flag" else "",  # of an option without a value
+            metavar="VALUE",
+            help=text.replace("%", "%%"),  # argparse would fill in %
         )
     return parser
 
@@ -65,7 +65,9 @@ def ros_arguments(command: str, arguments: Sequence[str]) -> list[str]:
     An InputError lists every plain option, value and name of a parameter that is
     refused.
     """
-    specs, plain, ros = _specs_of(command), list[str](), list[str]()
+    specs = _specs_of(command)
+    plain: list[str] = []
+    ros: list[str] = []
     destination = plain
     for argument in arguments:  # as rcl sorts them
         if argument == "--ros-args":
@@ -76,22 +78,22 @@ def ros_arguments(command: str, arguments: Sequence[str]) -> list[str]:
             destination.append(argument)
     # A parameter is an option by its name, too: --publish_rate.
     dashed = [
-        re.sub("^--[^=]*", lambda m: m[0].replace("_", "-"), argument)
+        re.sub("^--[^=]*", lambda option: option[0].replace("_", "-"), argument)
         for argument in plain
     ]
     options_given, unknown = make_parser(command).parse_known_args(dashed)
-    named = [re.split("[=:]", argument)[0] for argument in unknown]
-    checks = [unknown_name(argument, map(_option, specs)) for argument in named]
+    checks: list[Check] = []
+    for argument in unknown:
+        option, *_ = re.split("[=:]", argument)
+        checks.append(unknown_name(option, map(_option, specs)))
     for flag, rule in pairwise(ros):
-        name = rule.partition(":=")[0].rpartition(":")[2]
-        if (
-            flag in ("-p", "--param")
-            and name not in specs
-            and not name.startswith(FOREIGN)
-        ):
-            checks.append(unknown_name(name, specs))
+        if flag in ("-p", "--param"):
+            node_and_name, _, _ = rule.partition(":=")
+            _, _, name = node_and_name.rpartition(":")
+            if name not in specs and not name.startswith(FOREIGN):
+                checks.append(unknown_name(name, specs))
         if flag == "--log-level":
-            level = rule.rpartition(":=")[2]
+            _, _, level = rule.rpartition(":=")
             requirement = f"must be one of {', '.join(LOG_LEVELS)}"
             checks.append((flag, level, level.lower() in LOG_LEVELS, requirement))
     options: list[str] = []
@@ -105,7 +107,9 @@ def ros_arguments(command: str, arguments: Sequence[str]) -> list[str]:
                 (_option(name), argument or None, False, needs + spec.describe())
             )
     refuse_unless(command, *checks)
-    return ["--ros-args", *ros, *options] if ros or options else []
+    if not ros and not options:
+        return []
+    return ["--ros-args", *ros, *options]
 
 
 def unknown_name(name: str, valid_names: Iterable[str]) -> Check:
@@ -115,13 +119,10 @@ def unknown_name(name: str, valid_names: Iterable[str]) -> Check:
     if advice is not None:
         return "parameter", name, False, advice
     hint = suggestion(name, names) or f"; known are {', '.join(names)}"
-    behind = ", unless behind --ros-args" if name.startswith("-") else ""
-    return (
-        "argument" if behind else "parameter",
-        name,
-        False,
-        f"is no parameter of the node{behind}{hint}",
-    )
+    refused = "is no parameter of the node"
+    if name.startswith("-"):
+        return "argument", name, False, f"{refused}, unless behind --ros-args{hint}"
+    return "parameter", name, False, f"{refused}{hint}"
 
 
 def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:
@@ -130,7 +131,9 @@ def unused_files(ros: Sequence[str], node: str) -> Iterator[str]:
     The node is given by its full name. The files are those that rcl has read from the
     ROS arguments.
     """
-    for path in (path for flag, path in pairwise(ros) if flag == "--params-file"):
+    for flag, path in pairwise(ros):
+        if flag != "--params-file":
+            continue
         requirement = "must be a readable file"
         with refuse_errors(
             node, "--params-file", path, requirement, OSError, ValueError
@@ -177,10 +180,9 @@ def _as_yaml(spec: Spec, text_given: str) -> str:
     if spec.shape or spec.kind == "texts":
         value = _read_list(value)
     text = json.dumps(accept(spec, value), ensure_ascii=False)
-    # YAML 1.1 reads 1e-9 as text.
-    return (
-        re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text) if spec.kind == "number" else text
-    )
+    if spec.kind == "number":  # YAML 1.1 reads 1e-9 as text
+        return re.sub(r"(?<![\d.])(\d+)e", r"\1.0e", text)
+    return text
 
 
 def _read_list(text: str) -> list[str]:
@@ -191,12 +193,11 @@ def _read_list(text: str) -> list[str]:
     inner = text.strip()
     if inner.startswith("[") and inner.endswith("]"):
         inner = inner[1:-1]
-    entries = [entry.strip() for entry in inner.split(",")]
-    return [
-        (
-            entry[1:-1]
-            if len(entry) > 1 and entry[0] == entry[-1] and entry[0] in "\"'"
-            else entry
-        )
-        for entry in entries
-    ]
+    return [_unquote(entry.strip()) for entry in inner.split(",")]
+
+
+def _unquote(text: str) -> str:
+    """Return a text without the quotes around it, if there are any."""
+    if len(text) > 1 and text[0] == text[-1] and text[0] in "\"'":
+        return text[1:-1]
+    return text

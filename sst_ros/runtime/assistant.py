@@ -20,16 +20,17 @@ from sst_ros.errors import SstError
 class Assistant:
     """A process of low priority that calls one function, which pickle takes.
 
-    It ends with this one.
-
-    What takes longer than a control period is computed there: a thread would share the
-    interpreter's lock with the control. A thread here waits for that process, which may
-    take long to read and to write what the kernel does not hold at once.
+    It ends with this one. What takes longer than a control period is computed there: a
+    thread would share the interpreter's lock with the control. A thread here waits for
+    that process, which may take long to read and to write what the kernel does not hold
+    at once.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._function, self._closed = function, False
-        self._calls, self._results = SimpleQueue[Any](), SimpleQueue[Any]()
+        self._function = function
+        self._closed = False
+        self._calls: SimpleQueue[Any] = SimpleQueue()
+        self._results: SimpleQueue[Any] = SimpleQueue()
         self._begin()
         threading.Thread(target=self._exchange, name="assistant", daemon=True).start()
 
@@ -51,13 +52,14 @@ class Assistant:
         self._calls.put(arguments)
 
     def result(self) -> Any:
-        """Return the result of the call, or the SstError why there is none.
+        """Return the result of the call, None until it is there.
 
-        None until it is there.
-
-        Where the process has ended another one is begun.
+        It is an SstError where the call has failed. Where the process has ended, it
+        says so, and another one is begun.
         """
-        return None if self._results.empty() else self._results.get()
+        if self._results.empty():
+            return None
+        return self._results.get()
 
     def _exchange(self) -> None:
         while not self._closed:
@@ -93,6 +95,8 @@ def assist(number: int) -> None:
             arguments = connection.recv()
             try:
                 result = function(*arguments)
+            except SstError as error:
+                result = error
             except Exception as error:
-                result = error if isinstance(error, SstError) else SstError(repr(error))
+                result = SstError(repr(error))
             connection.send(result)

@@ -20,35 +20,32 @@ from typing import Any
 
 from sst_ros.errors import SstError
 
-# variable with the number of the process without which a node is to end
 PARENT = "SST_ROS_PARENT"
-_NODE_END_S = 10.0  # time that a node may take to end before it is killed
-_DOMAINS = 100  # ROS domains of this machine, 1 to 100: DDS allows 1 to 101 on Linux
-_PARTICIPANTS = 32  # ports of a domain that are probed: participants on one machine
-_next = itertools.count(os.getpid())  # what comes later leaves the last ones to end
+"""Variable with the number of the process without which a node is to end."""
+_NODE_END_S = 10.0
+"""Time that a node may take to end before it is killed."""
+_DOMAINS = 100
+"""ROS domains of this machine, 1 to 100: DDS allows 1 to 101 on Linux."""
+_PARTICIPANTS = 32
+"""Participants of a domain on this machine whose ports are probed."""
+# Domains in turn: one that was left just now may still have nodes that end.
+_next_domain = itertools.count(os.getpid())
 
 
 @contextmanager
 def run_beside(
     command: str, parameters: dict[str, object], **popen_options: Any
 ) -> Iterator[Popen[str]]:
-    """Have a node with parameters beside a block.
+    """Run a node with parameters beside a block.
 
-    It ends when this process does, however.
-
-    Behind the block it gets SIGINT, and is killed if its end takes 10 s.
+    Behind the block it gets SIGINT, and is killed if its end takes 10 s. It also ends
+    when this process does, however that ends.
     """
     keep_domain()
-    started = [
-        sys.executable,
-        "-m",
-        "sst_ros",
-        command,
-        "--ros-args",
-        *words(parameters),
-    ]
+    command_line = [sys.executable, "-m", "sst_ros", command]
+    command_line += ["--ros-args", *words(parameters)]
     with Popen(
-        started,
+        command_line,
         env={**os.environ, PARENT: str(os.getpid())},
         text=True,
         **popen_options,
@@ -67,7 +64,8 @@ def run_beside(
 def keep_domain() -> None:
     """Use the ROS domain of the environment, or else one that this process keeps."""
     if "ROS_DOMAIN_ID" not in os.environ:
-        os.environ["ROS_DOMAIN_ID"] = str(lock_domain()[0])
+        number, _ = lock_domain()  # until this process ends
+        os.environ["ROS_DOMAIN_ID"] = str(number)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
 
@@ -78,7 +76,7 @@ def lock_domain() -> tuple[int, int]:
     started.
     """
     for _ in range(_DOMAINS):
-        number = 1 + next(_next) % _DOMAINS
+        number = 1 + next(_next_domain) % _DOMAINS
         path = Path(tempfile.gettempdir()) / f"sst_ros_domain_{number}"
         with contextlib.suppress(OSError):  # of another user
             lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
@@ -99,22 +97,20 @@ def _refuse_nodes(domain: int) -> None:
 
     The ports are those of RTPS 2.5, 9.6.2.3.
     """
-    for port in range(7410 + 250 * domain, 7410 + 250 * domain + 2 * _PARTICIPANTS, 2):
+    first_port = 7400 + 250 * domain + 10  # unicast discovery of participant 0
+    for participant in range(_PARTICIPANTS):
+        port = first_port + 2 * participant
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("", port))
 
 
 def words(parameters: dict[str, object]) -> list[str]:
-    """Give parameters as --ros-args takes them."""
-    values = {
-        key: str(x).lower() if isinstance(x, bool) else x
-        for key, x in parameters.items()
-    }
-    return [
-        argument
-        for key, value in values.items()
-        for argument in ("-p", f"{key}:={value}")
-    ]
+    """Return parameters as --ros-args takes them."""
+    arguments: list[str] = []
+    for key, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        arguments += ["-p", f"{key}:={text}"]
+    return arguments
 
 
 def is_orphan() -> bool:

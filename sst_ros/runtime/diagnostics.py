@@ -183,7 +183,8 @@ class RunDiagnostics:
             missed=values["ticks_missed"],
         )
         if len(self._rows) == _MOST_ROWS:
-            self._rows = dict(list(self._rows.items())[1::2])
+            rows = list(self._rows.items())
+            self._rows = dict(rows[1::2])
 
     def status(self, values: dict[str, Any], warnings: list[str]) -> Status:
         """Return what is said of a run whose values have just been read.

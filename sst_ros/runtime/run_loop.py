@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """State machine of a run: waiting, running, paused, fault, finished.
 
-One thread owns it.
-
-Other threads send requests by `ask`. They are served between two samples, in the thread
-of the run. Diagnostics: one status a second, and at the end a table of errors over run
-time.
+One thread owns it. Other threads send requests by `ask`, which are served between two
+samples, in the thread of the run.
 """
 
 from __future__ import annotations
@@ -18,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from enum import Enum
+from pathlib import Path
 from typing import NamedTuple
 
 from sst_ros.errors import RunStopped, SstError
@@ -32,7 +30,9 @@ from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import Vector3
 
 _POLL_S = 0.001
+"""Longest sleep of a run that waits, and between two looks for a reply."""
 _LONGEST_REPLY_S = 30.0
+"""Longest wait for a reply: a step of a stiff scene may take seconds."""
 
 
 class Phase(str, Enum):
@@ -75,15 +75,22 @@ class RunLoop(TickLoop):
     def ask(self, request: Callable[[], Reply]) -> Reply:
         """Have a request (`pause`, `reset`, ...) served by the thread of the run.
 
-        Wait for its reply; the wait ends early where the run has stopped.
+        Wait for its reply; the wait ends early where the run has stopped. The time that
+        the run takes to load its code, which a busy machine makes long, does not count.
         """
         pending = self.post(request)
-        deadline = time.monotonic() + _LONGEST_REPLY_S
+        waits_since = time.monotonic()
         while not wait([pending], _POLL_S).done:
-            ends = self.stopped.is_set() or time.monotonic() > deadline
-            if ends and not pending.done():  # it may have been served just before
+            if self.loading:
+                waits_since = time.monotonic()
+            reason = ""
+            if self.stopped.is_set():
+                reason = self.fault or "the node is ending"
+            elif time.monotonic() - waits_since > _LONGEST_REPLY_S:
+                reason = f"the run did not reply within {_LONGEST_REPLY_S:g} s"
+            if reason and not pending.done():  # it may have been served just before
                 pending.cancel()
-                return Reply(False, f"not done: {self.fault or 'the node is ending'}")
+                return Reply(False, f"not done: {reason}")
         return pending.result()
 
     def post(self, request: Callable[[], Reply | None]) -> Future[Reply]:
@@ -122,7 +129,8 @@ class RunLoop(TickLoop):
                         self.show(fault=False, waits=True)
                     time.sleep(_POLL_S)
                 elif self.phase is Phase.RUNNING:
-                    if self.to_next_sample(paced=True) and self.complete:
+                    has_sample = self.to_next_sample(paced=True)
+                    if has_sample and self.complete:
                         self._stop_in(Phase.FINISHED)
                 elif self.phase in (Phase.PAUSED, Phase.FAULT):
                     self.show(fault=bool(self.fault))
@@ -131,7 +139,7 @@ class RunLoop(TickLoop):
                 self._fail(str(stopped))
             except Exception as error:
                 frame = traceback.extract_tb(error.__traceback__)[-1]
-                where = f"{frame.filename.rpartition('/')[2]}:{frame.lineno}"
+                where = f"{Path(frame.filename).name}:{frame.lineno}"
                 self._fail(f"internal error: {type(error).__name__}: {error} ({where})")
                 self.stopped.wait(IDLE_PERIOD_S)
         self.publish_rest()
@@ -226,12 +234,14 @@ class RunLoop(TickLoop):
         self.requested.clear()
         while self._requests:
             request, pending = self._requests.popleft()
-            if pending.set_running_or_notify_cancel():
-                reply = _NOT_DONE
-                try:
-                    reply = _NOT_DONE if refuses else request() or Reply(True, "")
-                finally:
-                    pending.set_result(reply)
+            if not pending.set_running_or_notify_cancel():
+                continue
+            reply = _NOT_DONE
+            try:
+                if not refuses:
+                    reply = request() or Reply(True, "")
+            finally:
+                pending.set_result(reply)
 
     def _start(self, waits: bool) -> bool:
         """Start the run and return whether it runs.
@@ -239,24 +249,34 @@ class RunLoop(TickLoop):
         It has to wait for the subscribers of the parameters, and with `waits` for a
         command, too.
         """
-        if self._missing_since is not None:  # of subscribers that have to be there once
-            if missing := self._output.missing_subscribers():
-                if (
-                    time.monotonic() - self._missing_since
-                    > self._run.subscriber_timeout
-                ):
-                    reason = (
-                        f"within {self._run.subscriber_timeout:g} s"
-                        " (wait_for_subscribers)"
-                    )
-                    self.failed = True
-                    raise NoAnswer(f"no subscriber of {', '.join(missing)} {reason}")
-                return False
-            self._missing_since = None
-        if (waits and not self._input.starts_run()) or not self.begin():
+        if not self._has_subscribers():
+            return False
+        if waits and not self._input.starts_run():
+            return False
+        if not self.begin():
             return False
         self._resume()
         return True
+
+    def _has_subscribers(self) -> bool:
+        """Return whether all subscribers that have to be there once have been there.
+
+        Raises:
+            NoAnswer: they have not within subscriber_timeout; the node ends by that.
+
+        """
+        if self._missing_since is None:
+            return True
+        missing = self._output.missing_subscribers()
+        if not missing:
+            self._missing_since = None
+            return True
+        timeout = self._run.subscriber_timeout
+        if time.monotonic() - self._missing_since > timeout:
+            self.failed = True
+            reason = f"within {timeout:g} s (wait_for_subscribers)"
+            raise NoAnswer(f"no subscriber of {', '.join(missing)} {reason}")
+        return False
 
     def _resume(self) -> None:
         self._to(Phase.RUNNING)

@@ -63,7 +63,9 @@ class CpuDmaLatency:
     """
 
     def __init__(self, device: Path = Path("/dev/cpu_dma_latency")) -> None:
-        self._device, self._asked_us, self._granted = device, -1, NO_LIMIT
+        self._device = device
+        self._asked_us = -1
+        self._granted = NO_LIMIT
         self._file: BinaryIO | None = None
 
     def request(self, latency_us: int) -> str:
@@ -75,16 +77,16 @@ class CpuDmaLatency:
             return self._granted
         if self._file is not None:
             self._file.close()
-        self._file, self._granted = None, NO_LIMIT
+        self._file = None
+        self._granted = NO_LIMIT
         if latency_us >= 0:
             try:
                 self._file = self._device.open("r+b", buffering=0)
                 self._file.write(latency_us.to_bytes(4, sys.byteorder))
                 self._granted = f"{latency_us} us"
             except OSError as error:
-                self._granted = (
-                    f"{NO_LIMIT}: {latency_us} us is not permitted ({error})"
-                )
+                reason = f"{latency_us} us is not permitted ({error})"
+                self._granted = f"{NO_LIMIT}: {reason}"
         self._asked_us = latency_us
         return self._granted
 

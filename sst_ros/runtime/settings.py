@@ -210,15 +210,12 @@ class SimulatorParameters(NodeParameters):
 
     def rules(self) -> Rules:
         """Refuse rates that have no whole period, and bounds too small to be meant."""
-        rate, publish_rate = self.rate, self.publish_rate
+        rate = self.rate
         divides_second = "must divide 1e9, so that a step is whole nanoseconds"
         yield NANOSECONDS % rate, "rate", rate, divides_second
-        yield (
-            rate % publish_rate,
-            "publish_rate",
-            publish_rate,
-            f"must divide rate = {rate}",
-        )
+        divides_rate = f"must divide rate = {rate}"
+        remainder = rate % self.publish_rate
+        yield remainder, "publish_rate", self.publish_rate, divides_rate
         waits = self.sync == "lockstep" and self.dropped_samples
         requirement = "must be 0 in lockstep, where each sample is answered"
         yield waits, "dropped_samples", self.dropped_samples, requirement
@@ -253,8 +250,10 @@ class SimulatorParameters(NodeParameters):
             angle_noise=self.angle_noise,
             rate_noise=self.rate_noise,
         )
-        plain = ControlChannel(period=channel.period)
-        return None if channel == plain and not self.dropped_samples else channel
+        exact = ControlChannel(period=channel.period)
+        if channel == exact and not self.dropped_samples:
+            return None
+        return channel
 
 
 class AnsweringParameters(NodeParameters):

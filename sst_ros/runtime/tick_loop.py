@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ticks of a run, at absolute deadlines, from one published sample to the next.
 
-Late ticks are counted, never made up for. All is owned by the thread of the run.
+`TickLoop.to_next_sample` is the loop; before it stand its deadlines, its counters, and
+the estimate of what it costs that torques are held. Late ticks are counted, never made
+up for. All is owned by the thread of the run.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from sst_ros.mechanism.generic_math import add, axpy
 from sst_ros.runtime.torque_input import RunSettings, TorqueInput
 from sst_ros.scene.torque_profile import SineTorque
 from sst_ros.simulation.simulation import Simulation
-from sst_ros.state import ZERO, State, Vector3
+from sst_ros.state import NANOSECONDS, STAR_RATE, ZERO, State, Vector3
 
 _LONGEST_SLEEP_S = 0.05
 """Longest sleep between two looks at what may interrupt a wait."""
@@ -28,7 +30,8 @@ _POLL_S = 0.001
 """Longest sleep between two looks for an answer in lockstep."""
 IDLE_PERIOD_S = 0.1
 """Period in which the state of a run that does not advance is shown."""
-_LOAD_S = 0.02  # loading what has been loaded takes less; then nothing is shown
+_LOAD_S = 0.02
+"""To load code once more takes less; then no state is shown."""
 _STEP_ANSWER_S = 0.4
 """Longest wait for the answer in a step of a paused run.
 
@@ -78,9 +81,12 @@ class Pacer:
         self._period_ns = period_ns
         self._source = source
         self._tolerance_ns = tolerance_ns
-        self._anchor = self._count = self._last_seen_ns = 0
+        self._anchor = 0  # from which the deadlines are counted [ns]
+        self._count = 0  # periods from there to the next deadline
+        self._last_seen_ns = 0  # time of the clock when it was read last
         self._set(speed)
-        self.missed = self.overruns = 0  # ticks dropped, and times that some were
+        self.missed = 0  # ticks dropped
+        self.overruns = 0  # times that some were
         self.jumps = 0  # of the clock, back
         self.late_ns = 0  # of the start of the last tick
 
@@ -136,7 +142,7 @@ class Pacer:
                 break
             if slept and interrupted():
                 return False
-            self._source.sleep(min(-late / 1e9, _LONGEST_SLEEP_S))
+            self._source.sleep(min(-late / NANOSECONDS, _LONGEST_SLEEP_S))
             slept = True
         if late >= self._interval and late >= self._tolerance_ns:
             dropped = int(late // self._interval)
@@ -149,15 +155,15 @@ class Pacer:
 
 
 class Counters:
-    """Counters of a run: steps, samples published, resets, states set.
-
-    Times of steps.
-    """
+    """Counters of a run, times of its steps, and how late they begin."""
 
     def __init__(self) -> None:
-        self.ticks = self.published = self.resets = self.states_set = 0
-        # The longest step is that of the call with the longest mean.
-        self._step_total_s = self.step_max_s = 0.0
+        self.ticks = 0
+        self.published = 0  # samples
+        self.resets = 0
+        self.states_set = 0
+        self._step_total_s = 0.0
+        self.step_max_s = 0.0  # mean of the call whose mean is the longest
         # Ticks that one call may take: one as long as none has been measured.
         self.ticks_at_once = 1
         self._late_total = self._late_max = 0.0  # [us]
@@ -182,9 +188,8 @@ class Counters:
         self._step_total_s += took_s
         if took_s > self.step_max_s * ticks:
             self.step_max_s = took_s / ticks
-            self.ticks_at_once = int(
-                min(max(1.0, _AT_ONCE_S / self.step_max_s), _TICKS_AT_ONCE)
-            )
+            within_time = max(1.0, _AT_ONCE_S / self.step_max_s)
+            self.ticks_at_once = int(min(within_time, _TICKS_AT_ONCE))
         late = 1e-3 * late_ns
         self._late_total += late * ticks
         self._late_square += late * late * ticks
@@ -194,9 +199,10 @@ class Counters:
     @property
     def wall_s(self) -> float:
         """Time spent running [s]."""
-        return self._wall_s + (
-            time.monotonic() - self._resumed if self._resumed else 0.0
-        )
+        resumed = self._resumed  # the thread of the run may hold meanwhile
+        if resumed is None:
+            return self._wall_s
+        return self._wall_s + (time.monotonic() - resumed)
 
     @property
     def step_mean_s(self) -> float:
@@ -230,7 +236,9 @@ class HeldTorques:
 
     def clear(self) -> None:
         """Forget the torques."""
-        self._torques: list[Vector3] = []  # the first two and the last
+        self._first: Vector3 | None = None
+        self._second: Vector3 | None = None  # the first that is another one
+        self._last = ZERO
         self._impulse = ZERO
         self._seconds = 0.0
         self._changes = 0
@@ -239,15 +247,20 @@ class HeldTorques:
         """Add torques [N m] that were held for some time [s]; a sine is not held."""
         if isinstance(torque, SineTorque):
             return
-        if not self._torques or torque != self._torques[-1]:
-            self._torques = [*self._torques[:2], torque]
+        if self._first is None:
+            self._first = torque
+            self._changes = 1
+        elif torque != self._last:
+            self._second = self._second or torque
             self._changes += 1
+        self._last = torque
         self._seconds += seconds
         impulse_1, impulse_2, impulse_3 = self._impulse
+        torque_1, torque_2, torque_3 = torque
         self._impulse = (
-            impulse_1 + seconds * torque[0],
-            impulse_2 + seconds * torque[1],
-            impulse_3 + seconds * torque[2],
+            impulse_1 + seconds * torque_1,
+            impulse_2 + seconds * torque_2,
+            impulse_3 + seconds * torque_3,
         )
 
     def errors(self, simulation: Simulation) -> tuple[float, float] | None:
@@ -257,24 +270,26 @@ class HeldTorques:
         is returned where fewer than two torques were held, or where the torques of the
         actuators lag.
         """
-        if len(self._torques) < 2 or len(simulation.dynamics.state) > 7:
+        first = self._first
+        second = self._second
+        if first is None or second is None or simulation.scene.lags:
             return None
-        first, second, last = self._torques[0], self._torques[1], self._torques[-1]
         period = self._seconds / self._changes
         late = axpy(1.0, self._impulse, -self._seconds, first)
         drift = axpy(self._changes, second, -self._changes, first)
-        lost = add(axpy(1.0, last, -1.0, first), drift)
+        lost = add(axpy(1.0, self._last, -1.0, first), drift)
         # How much the body acceleration changes by a change of the torques.
         state = simulation.state
         dynamics = simulation.dynamics
         y = (*state.quaternion, *state.body_rate)
-        other_inputs = (0.0,) * (len(dynamics.drive) - 3)
+        other_inputs = (0.0,) * (len(dynamics.drive) - len(ZERO))
         without, by_late, by_lost = (
-            dynamics.derivative(*y, *torque, *other_inputs)[4:7]
+            dynamics.derivative(*y, *torque, *other_inputs)[STAR_RATE]
             for torque in (ZERO, late, lost)
         )
         of_start = 0.5 * period * math.dist(by_late, without)
-        return of_start, period**2 / 24.0 * math.dist(by_lost, without)
+        of_middle = period**2 / 24.0 * math.dist(by_lost, without)
+        return of_start, of_middle
 
 
 class NoAnswer(SstError):
@@ -296,6 +311,7 @@ class TickLoop:
     def __init__(self, simulation: Simulation, parts: RunParts) -> None:
         self.simulation = simulation  # its `state` may be read by any thread
         self.begun = False  # the first sample has been published
+        self.loading = False  # code is loaded, and no request is served meanwhile
         self.counters = Counters()
         self.held = HeldTorques()
         # Set by others to interrupt a wait, or to end.
@@ -310,10 +326,14 @@ class TickLoop:
         self._ticks_per_sample = run.ticks_per_sample
         self._control_ns = run.period_ns * run.ticks_per_sample
         self._idle_step_ns = self._control_ns if run.lockstep and run.own_clock else 0
-        self._tick = self._start_ns = self._stamp_ns = self._idle_ns = 0
+        self._tick = 0  # ticks done
+        self._start_ns = 0  # stamp of the first sample
+        self._stamp_ns = 0  # stamp of the last sample
+        self._idle_ns = 0  # stamp of the last state that was shown
         # in lockstep, an answer whose deadline has not come
         self._kept: Vector3 | None = None
-        self._awaited_since = self._waits_since = time.monotonic()
+        self._awaited_since = time.monotonic()  # an answer to the last sample
+        self._waits_since = time.monotonic()  # the next sample
 
     def warm_up(self) -> None:
         """Load the code of every method, take the first step and go back.
@@ -333,12 +353,16 @@ class TickLoop:
 
         loader = threading.Thread(target=load, name="load code", daemon=True)
         loader.start()
-        loader.join(_LOAD_S)
-        while loader.is_alive():
-            if self.stopped.is_set():
-                return
-            self.show(fault=False, waits=True)
-            loader.join(IDLE_PERIOD_S)
+        self.loading = True
+        try:
+            loader.join(_LOAD_S)
+            while loader.is_alive():
+                if self.stopped.is_set():
+                    return
+                self.show(fault=False, waits=True)
+                loader.join(IDLE_PERIOD_S)
+        finally:
+            self.loading = False
         if failures:
             raise failures[0]
         with contextlib.suppress(RunStopped):
@@ -414,34 +438,45 @@ class TickLoop:
         self._waits_since = time.monotonic()
         while True:
             ticks = self._ticks_left()
-            unread = 0  # samples that nothing receives
+            passed_over = 0  # samples that nothing receives
             if interval_ns:
                 ticks = min(ticks, self._pacer.together)
             elif paced and not self._lockstep and self._output.unread:
-                # Samples behind the one that these ticks lead to, within what is done
-                # at once.
-                if (self._tick + ticks) % self._ticks_per_sample == 0:
-                    most = min(
-                        self._last_tick - self._tick, self.counters.ticks_at_once
-                    )
-                    unread = (most - ticks) // self._ticks_per_sample
-                ticks += unread * self._ticks_per_sample
+                passed_over = self._samples_behind(ticks)
+                ticks += passed_over * self._ticks_per_sample
             if paced and not self._pacer.wait(self._is_interrupted, ticks):
                 return False
-            now_ns = time.monotonic_ns()
-            while ticks:
-                begins = now_ns - (ticks - 1) * interval_ns
-                torque = self._kept or self._input.torque(self.simulation, begins)
-                equal = ticks if self._kept or self._input.constant(now_ns) else 1
-                self._advance(torque, equal)
-                ticks -= equal
-            self.counters.published += unread
+            self._do_ticks(ticks, interval_ns)
+            self.counters.published += passed_over
             if self._tick % self._ticks_per_sample == 0 or self.complete:
                 self._kept = None
                 self._publish()
                 return True
             if paced and self._is_interrupted():
                 return False
+
+    def _samples_behind(self, ticks: int) -> int:
+        """Return how many more samples the ticks of one call can pass.
+
+        They are those behind the sample that some ticks lead to, if they lead to one.
+        """
+        if (self._tick + ticks) % self._ticks_per_sample != 0:
+            return 0
+        most = min(self._last_tick - self._tick, self.counters.ticks_at_once)
+        return (most - ticks) // self._ticks_per_sample
+
+    def _do_ticks(self, ticks: int, interval_ns: int) -> None:
+        """Do ticks of which the last begins now, each under the torques at its begin.
+
+        Those between which no torque changes are one call.
+        """
+        now_ns = time.monotonic_ns()
+        while ticks:
+            begins_ns = now_ns - (ticks - 1) * interval_ns
+            torque = self._kept or self._input.torque(self.simulation, begins_ns)
+            equal = ticks if self._kept or self._input.constant(now_ns) else 1
+            self._advance(torque, equal)
+            ticks -= equal
 
     def _is_interrupted(self) -> bool:
         late = (
@@ -464,29 +499,34 @@ class TickLoop:
     def show(self, *, fault: bool, waits: bool = False) -> None:
         """Publish the state of a run that does not advance, marked as idle.
 
-        Its stamp is the ROS time at which the state holds: that of the last sample
-        where samples will follow it, else the present time; 0 before the first time of
-        a followed clock. Stamps never go back or repeat; where time stands still they
-        differ by 1 ns, because tf2 warns of transforms that have the stamp of the one
-        before.
-
         In lockstep our /clock moves by a control period where the run waits:
         controllers that are updated by it can become active, and the run begins one
         update after what a command answers.
         """
         moves = waits and self._idle_step_ns > 0
-        later_ns = max(self._stamp_ns, self._idle_ns) + 1
-        if fault or not self.begun:
-            now_ns = self._output.now_ns()
-            if moves:
-                now_ns += self._idle_step_ns
-            has_time = max(now_ns, self._stamp_ns, self._idle_ns) > 0
-            stamp_ns = max(now_ns, later_ns) if has_time else 0
-        else:
-            stamp_ns = min(later_ns, self._stamp_ns + self._period_ns - 1)
+        stamp_ns = self._next_idle_stamp_ns(fault=fault, moves=moves)
         self._output.idle(self.simulation.state, stamp_ns, at_rest=fault, moves=moves)
         self._idle_ns = stamp_ns
         self._input.accept_idle(stamp_ns, alone=moves)
+
+    def _next_idle_stamp_ns(self, *, fault: bool, moves: bool) -> int:
+        """Return the ROS time at which a state that is shown now holds [ns].
+
+        It is that of the last sample where samples will follow it, else the present
+        time; 0 before the first time of a followed clock. Stamps never go back or
+        repeat; where time stands still they differ by 1 ns, because tf2 warns of
+        transforms that have the stamp of the one before.
+        """
+        later_ns = max(self._stamp_ns, self._idle_ns) + 1
+        if self.begun and not fault:  # samples follow
+            return min(later_ns, self._stamp_ns + self._period_ns - 1)
+        now_ns: int = self._output.now_ns()
+        if moves:
+            now_ns += self._idle_step_ns
+        has_shown_time = self._stamp_ns > 0 or self._idle_ns > 0
+        if now_ns > 0 or has_shown_time:
+            return max(now_ns, later_ns)
+        return 0
 
     def _ticks_left(self) -> int:
         left = self._ticks_per_sample - self._tick % self._ticks_per_sample
@@ -515,7 +555,8 @@ class TickLoop:
                 return None
             waited = time.monotonic() - self._awaited_since
             timeout = self._run.lockstep_timeout or math.inf
-            timeout = timeout if paced else min(timeout, _STEP_ANSWER_S)
+            if not paced:
+                timeout = min(timeout, _STEP_ANSWER_S)
             if waited > timeout:
                 sample = f"the sample of {self._stamp_ns} ns"
                 raise NoAnswer(f"no command answered {sample} within {timeout:g} s")

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from sst_ros.scene.loads import JOINTS, Actuators
+from sst_ros.scene.loads import ACTUATED_JOINTS, Actuators
 from sst_ros.simulation.simulation import Simulation
 from sst_ros.state import (
     BASE_FRAME,
@@ -22,7 +22,6 @@ from sst_ros.state import (
     nanoseconds,
 )
 
-ACTUATED_JOINTS = JOINTS[:3]
 _SHOWN_NAMES = 6  # entries of a list in the reason of a refusal
 
 MOST_WAITING = 50
@@ -85,8 +84,13 @@ class TorqueInput:
         self._run = run
         self._limit = actuators.torque_limit if actuators else None
         self._damping = actuators.idle_damping if actuators else 0.0
-        self._commands, self._stamped, self._moments = commands, stamped, moments
-        self.received = self.dropped = self.clamped = self.timeouts = 0
+        self._commands = commands
+        self._stamped = stamped
+        self._moments = moments
+        self.received = 0
+        self.dropped = 0
+        self.clamped = 0
+        self.timeouts = 0  # times that the command became too old
         self.reasons: dict[str, int] = {}  # of dropped messages, with counts
         self._forget()
 
@@ -97,11 +101,14 @@ class TorqueInput:
         self._forget()
 
     def _forget(self) -> None:
-        self._torque = self.moment = ZERO  # torques; external moment in {B} [N m]
+        self._torque = ZERO  # of the last command [N m]
+        self.moment = ZERO  # external, in {B} [N m]
         self.begun = False  # a command has come since the start
         self.stale = False  # the last one is older than command_timeout and not used
         self.last_refusal = ""
-        self._idle_ns = [0, 0]  # first and last stamp whose answers are accepted
+        # first and last stamp of the states shown whose answers are accepted
+        self._first_idle_ns = 0
+        self._last_idle_ns = 0
         self.refresh()
 
     def refresh(self) -> None:
@@ -136,10 +143,9 @@ class TorqueInput:
 
         With `alone`, answers to no other state are accepted.
         """
-        first_ns = self._idle_ns[0]
-        if alone or first_ns == 0:
-            first_ns = stamp_ns
-        self._idle_ns = [first_ns, stamp_ns]
+        if alone or self._first_idle_ns == 0:
+            self._first_idle_ns = stamp_ns
+        self._last_idle_ns = stamp_ns
 
     def starts_run(self) -> bool:
         """Take the messages that arrived before the run.
@@ -181,14 +187,18 @@ class TorqueInput:
             )
         now_ns = time.monotonic_ns()
         for message in self._read_stamped(math.inf):
-            stamp = nanoseconds(message.header.stamp)
-            to_idle = stamp == 0 or self._idle_ns[0] <= stamp <= self._idle_ns[1]
-            behind = stamp - (stamp_ns or 0)
-            fits = to_idle if stamp_ns is None else 0 <= behind < self._run.period_ns
+            answered_ns = nanoseconds(message.header.stamp)
+            to_idle = answered_ns == 0 or (
+                self._first_idle_ns <= answered_ns <= self._last_idle_ns
+            )
+            if stamp_ns is None:
+                fits = to_idle
+            else:
+                fits = 0 <= answered_ns - stamp_ns < self._run.period_ns
             if torque is None and fits:
                 torque = self._accept(torque_by_name, message, now_ns)
             elif not to_idle:
-                reason = f"stamp {stamp} ns answers no sample that waits"
+                reason = f"stamp {answered_ns} ns answers no sample that waits"
                 self._drop(MessageRefused("stamp", reason))
         self._take_moments(now_ns)
         return torque
@@ -275,12 +285,11 @@ class TorqueInput:
 
 def three_numbers(data: Sequence[float], quantity: str = "torques [N m]") -> Vector3:
     """Return three finite numbers, or raise MessageRefused."""
-    if (vector := finite_vector(data)) is None:
-        reason_key = "not finite" if len(data) == 3 else "wrong size"
-        raise MessageRefused(
-            reason_key, f"{_shorten(data)} must be 3 finite {quantity}"
-        )
-    return vector
+    vector = finite_vector(data)
+    if vector is not None:
+        return vector
+    reason_key = "not finite" if len(data) == 3 else "wrong size"
+    raise MessageRefused(reason_key, f"{_shorten(data)} must be 3 finite {quantity}")
 
 
 def torque_by_name(message: Any) -> Vector3:

@@ -9,7 +9,7 @@ from array import array
 from concurrent.futures import Future
 from enum import Enum
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,11 +37,12 @@ from sst_ros.state import NANOSECONDS, ZERO, Vector3
 _FIRST_PERIODS_AHEAD = 25
 """Control periods that the first check may take where the reference moves.
 
-Then twice the last.
+Later ones may take twice as long as the last.
 """
 _MOST_CHECKS = 5
-# numbers of samples, 19 each, that are added to the tracking metrics at once
-_NUMBERS_AT_ONCE = 256 * 19
+"""Checks of one trajectory, after which it is refused: the machine is too busy."""
+_ROWS_AT_ONCE = 256
+"""Samples that are added to the tracking metrics at once."""
 
 
 class Order:
@@ -58,13 +59,23 @@ class Order:
         self, points: Points, measured: Measurement | None, seen_ns: int
     ) -> None:
         self.points = points
-        self.measured, self.seen_ns = measured, seen_ns
+        self.measured = measured
+        self.seen_ns = seen_ns  # stamp of what was measured
         self.outcome: Future[None] = Future()
-        # checks, and the sample at the last one
-        self.passed, self.asked, self.asked_ns = 0.0, 0, 0
+        self.passed = 0.0
+        self.checks = 0  # that are done
+        self.asked_ns = 0  # stamp of the sample at which the last was asked for
         self.begin: Reference | None = None  # the reference from which it was planned
-        # of that; None where it stands still until then
+        # stamp of that; None where it stands still until then
         self.begin_ns: int | None = None
+
+
+class _Upcoming(NamedTuple):
+    """A motion that is followed from a stamp on [ns]."""
+
+    begin_ns: int
+    motion: ReferenceMotion
+    order: Order
 
 
 class Stage(Enum):
@@ -96,11 +107,9 @@ class TrajectoryFollower:
     """
 
     def __init__(self, model: Scene, settings: ControllerNodeParameters) -> None:
-        self._model, self._settings, self._geometry = (
-            model,
-            settings,
-            Geometry.of(model),
-        )
+        self._model = model
+        self._settings = settings
+        self._geometry = Geometry.of(model)
         limit = float(command_limit(settings.torque_limit, model))
         if math.isfinite(limit):  # for the check of motions, too
             self._model = model.with_values({"actuators.torque_limit": limit})
@@ -108,17 +117,20 @@ class TrajectoryFollower:
         if settings.motion == "scene":
             self._planned = reference_motion(model, _read_motion)
             check_motion(self._planned, self._model)
-        self._plan, self._assistant = partial(plan, self._model), None
+        self._plan = partial(plan, self._model)
+        self._assistant: Assistant | None = None
         # from a sample to the instant from which a trajectory is planned
         self._ahead_ns = 0
         if settings.motion == "topic" and not settings.stamped:
             self._assistant = Assistant(self._plan)
             self._ahead_ns = _FIRST_PERIODS_AHEAD * settings.period_ns
-        self._checked: Order | None = None
-        self._waiting: Order | None = None
-        self.samples = self.irregular = self.limited = 0
-        self._start_ns: int | None = None
-        self._record_ns = 0
+        self._checked: Order | None = None  # the assistant checks it now
+        self._waiting: Order | None = None  # is checked next
+        self.samples = 0
+        self.irregular = 0
+        self.limited = 0
+        self._start_ns: int | None = None  # stamp at which the motion begins
+        self._record_ns = 0  # stamp at which the record of tracking errors begins
         self.restart()
 
     def close(self) -> None:
@@ -130,13 +142,14 @@ class TrajectoryFollower:
         """Forget the run, as after a reset of the simulator, and all trajectories."""
         for order in filter(None, (self._checked, self._waiting)):
             order.outcome.cancel()
-        self.stage, self._last_ns, self._waiting = Stage.WAITING, 0, None
-        self._rows, self._metrics = array("d"), TrackingMetrics()
+        self.stage = Stage.WAITING
+        self._waiting = None
+        self._forget_record()
         self._last: Command | None = None
+        self._last_ns = 0  # stamp of the last sample that was answered
         self.order: Order | None = None
         self.finished: TrackingMetrics | None = None
-        # by the stamps they begin at
-        self._upcoming: list[tuple[int, ReferenceMotion, Order]] = []
+        self._upcoming: list[_Upcoming] = []  # in the order in which they begin
         if self._planned is not None:
             self._prepare(self._planned)
 
@@ -149,10 +162,8 @@ class TrajectoryFollower:
         from where the manipulator was `measured` last, at rest. Where it is refused,
         nothing changes.
         """
-        motion, requirement = (
-            self._settings.motion,
-            "must be topic, for trajectories to be taken",
-        )
+        motion = self._settings.motion
+        requirement = "must be topic, for trajectories to be taken"
         refuse_unless(
             "joint_trajectory", ("motion", motion, motion == "topic", requirement)
         )
@@ -179,10 +190,11 @@ class TrajectoryFollower:
         """Have the newest trajectory checked, and follow it once it has been."""
         while self._checked or self._waiting:
             if self._checked is None:
-                order, self._waiting = self._waiting, None
+                order = self._waiting
+                self._waiting = None
                 assert order is not None
                 try:
-                    arguments = order.points, *self._place(order)
+                    arguments = (order.points, *self._place(order))
                     if self._assistant is None:
                         self._follow(order, self._plan(*arguments))
                         continue
@@ -192,9 +204,11 @@ class TrajectoryFollower:
                 self._assistant.call(*arguments)
                 self._checked = order
             assert self._assistant is not None
-            if (result := self._assistant.result()) is None:
+            result = self._assistant.result()
+            if result is None:
                 return
-            order, self._checked = self._checked, None
+            order = self._checked
+            self._checked = None
             self._settle(order, result)
 
     def _place(self, order: Order) -> tuple[Reference, float, Vector3]:
@@ -219,7 +233,9 @@ class TrajectoryFollower:
             motion, time = self._motion_at(now_ns)
             order.begin = motion.at(time)
             effort = motion.effort_at(time)
-        order.passed = max(0, now_ns - stamp_ns) / NANOSECONDS if stamp_ns else 0.0
+        order.passed = 0.0
+        if stamp_ns:
+            order.passed = max(0, now_ns - stamp_ns) / NANOSECONDS
         return order.begin, order.passed, effort or ZERO
 
     def _settle(self, order: Order, result: Any) -> None:
@@ -227,14 +243,12 @@ class TrajectoryFollower:
 
         It is repeated where the reference is another one by now.
         """
-        order.asked += 1
+        order.checks += 1
         if order.outcome.done():  # by a reset
             return
         if order.asked_ns:
-            took_ns, period_ns = (
-                self._last_ns - order.asked_ns,
-                self._settings.period_ns,
-            )
+            took_ns = self._last_ns - order.asked_ns
+            period_ns = self._settings.period_ns
             self._ahead_ns = max(2 * (took_ns + period_ns), self._ahead_ns - period_ns)
         if isinstance(result, ReferenceMotion) and self._is_timely(order):
             try:
@@ -245,13 +259,14 @@ class TrajectoryFollower:
             order.outcome.set_exception(result)
         elif self._waiting is not None:
             order.outcome.cancel()
-        elif order.asked == _MOST_CHECKS:
+        elif order.checks == _MOST_CHECKS:
             late = f"checked too late {_MOST_CHECKS} times, on a busy machine"
             order.outcome.set_exception(SstError(late))
         else:
             self._waiting = order
 
     def _is_timely(self, order: Order) -> bool:
+        """Return whether the reference still is the one from which it was planned."""
         if self._last is None:
             return True
         if order.begin_ns is None:
@@ -261,9 +276,8 @@ class TrajectoryFollower:
 
     def has(self, order: Order) -> bool:
         """Whether the trajectory is followed, or will be at its stamp."""
-        return order is self.order or any(
-            order is upcoming for _, _, upcoming in self._upcoming
-        )
+        orders = [self.order, *(upcoming.order for upcoming in self._upcoming)]
+        return any(order is followed for followed in orders)
 
     def _rests(self) -> bool:
         """Whether the reference stands still from now on."""
@@ -271,29 +285,30 @@ class TrajectoryFollower:
 
     def _motion_at(self, stamp_ns: int) -> tuple[ReferenceMotion, float]:
         """Return what is followed at a stamp to come, and its time then [s]."""
-        motion, start_ns = self._motion, self._start_ns or self._last_ns
-        for begin_ns, upcoming, _ in self._upcoming:
-            if begin_ns <= stamp_ns:
-                motion, start_ns = upcoming, begin_ns
+        motion = self._motion
+        start_ns = self._start_ns or self._last_ns
+        for upcoming in self._upcoming:
+            if upcoming.begin_ns <= stamp_ns:
+                motion = upcoming.motion
+                start_ns = upcoming.begin_ns
         return motion, (stamp_ns - start_ns) / NANOSECONDS
 
     def _follow(self, order: Order, motion: ReferenceMotion) -> None:
         """Follow a motion from its stamp on, and until then what is followed now."""
-        stamp_ns, start = order.points.stamp_ns, motion.at(0.0)
-        if self._last is None:
-            self._upcoming = (
-                [(stamp_ns, motion, order)] if stamp_ns > order.seen_ns else []
-            )
-            if self._upcoming:
-                self._prepare(ReferenceMotion(lambda _: start, (0.0,)))
-            else:
-                self._prepare(motion, order)
-        else:
+        stamp_ns = order.points.stamp_ns
+        start = motion.at(0.0)
+        if self._last is not None:
             start_ns = order.begin_ns or self._last_ns + self._settings.period_ns
             self._upcoming = [
-                upcoming for upcoming in self._upcoming if upcoming[0] < start_ns
+                upcoming for upcoming in self._upcoming if upcoming.begin_ns < start_ns
             ]
-            self._upcoming.append((start_ns, motion, order))
+            self._upcoming.append(_Upcoming(start_ns, motion, order))
+        elif stamp_ns > order.seen_ns:  # stands at its start until then
+            self._upcoming = [_Upcoming(stamp_ns, motion, order)]
+            self._prepare(ReferenceMotion(lambda _: start, (0.0,)))
+        else:
+            self._upcoming = []
+            self._prepare(motion, order)
         order.outcome.set_result(None)
 
     def stop(self) -> None:
@@ -334,19 +349,21 @@ class TrajectoryFollower:
         if self.stage is Stage.READY:
             self._refuse_elsewhere(measured)
             self.stage = Stage.FOLLOWING
-        else:
-            self.irregular += stamp_ns - self._last_ns != self._settings.period_ns
-        while self._upcoming and self._upcoming[0][0] <= stamp_ns:
+        elif stamp_ns - self._last_ns != self._settings.period_ns:
+            self.irregular += 1
+        while self._upcoming and self._upcoming[0].begin_ns <= stamp_ns:
             begin_ns, motion, order = self._upcoming.pop(0)
             self._controller.follow(motion)
             self._begin(motion, begin_ns, order)
             self.stage = Stage.FOLLOWING
         if self._start_ns is None:
-            self._start_ns = self._record_ns = stamp_ns
+            self._start_ns = stamp_ns
+            self._record_ns = stamp_ns
         passed_ns = stamp_ns - self._start_ns
         time = passed_ns / NANOSECONDS
         command = self._controller.command(time, measured)
-        self.limited += command.saturated
+        if command.saturated:
+            self.limited += 1
         if time >= self._motion.duration:
             self.stage = Stage.HOLDING
         end_ns = round((self._motion.duration + self._settings.hold) * NANOSECONDS)
@@ -354,16 +371,26 @@ class TrajectoryFollower:
             self.stage = Stage.ENDED
             command = dataclasses.replace(command, torque=ZERO)
         if passed_ns <= end_ns:
-            angles = *command.desired.gamma, *command.desired.gamma_dot, *command.error
-            torques = *command.feedforward, *command.feedback, *command.torque
-            self._rows.extend(
-                ((stamp_ns - self._record_ns) / NANOSECONDS, *angles, *torques)
-            )
-            if len(self._rows) >= _NUMBERS_AT_ONCE:
-                self._add_rows()
+            self._record(stamp_ns, command)
         self.samples += 1
-        self._last, self._last_ns = command, stamp_ns
+        self._last = command
+        self._last_ns = stamp_ns
         return command
+
+    def _record(self, stamp_ns: int, command: Command) -> None:
+        """Add a sample to the record of the tracking errors, as `track_of` reads it."""
+        row = (
+            (stamp_ns - self._record_ns) / NANOSECONDS,
+            *command.desired.gamma,
+            *command.desired.gamma_dot,
+            *command.error,
+            *command.feedforward,
+            *command.feedback,
+            *command.torque,
+        )
+        self._rows.extend(row)
+        if len(self._rows) >= _ROWS_AT_ONCE * len(row):
+            self._add_rows()
 
     def tracking(self) -> TrackingMetrics | None:
         """Return the tracking errors of the motion; None before two samples of it."""
@@ -380,10 +407,11 @@ class TrajectoryFollower:
     def errors(self) -> tuple[float, float]:
         """Root mean square and largest of all errors of the motion up to now [rad]."""
         self._add_rows()
-        rms, largest = self._metrics.rms, self._metrics.largest
-        return float(np.sqrt(np.mean(rms**2))), float(largest.max())
+        rms_of_all = np.sqrt(np.mean(self._metrics.rms**2))
+        return float(rms_of_all), float(self._metrics.largest.max())
 
     def _prepare(self, motion: ReferenceMotion, order: Order | None = None) -> None:
+        """Make a controller for a motion that begins with the next sample."""
         period = self._settings.period_ns / NANOSECONDS
         self._controller = Controller(self._model, motion, self._settings, period)
         self._begin(motion, None, order)
@@ -396,11 +424,19 @@ class TrajectoryFollower:
 
         The record of the tracking errors goes on where the reference was moving.
         """
-        self._motion, self._start_ns, self.order = motion, start_ns, order
+        self._motion = motion
+        self._start_ns = start_ns
+        self.order = order
         if self.stage is not Stage.FOLLOWING:
             self.finished = self.tracking()
-            self._rows, self._metrics, self.limited = array("d"), TrackingMetrics(), 0
+            self._forget_record()
+            self.limited = 0
             self._record_ns = start_ns or 0
+
+    def _forget_record(self) -> None:
+        """Forget the tracking errors."""
+        self._rows = array("d")  # of samples that the metrics do not have yet
+        self._metrics = TrackingMetrics()
 
     def _add_rows(self) -> None:
         """Add the samples since the last call to the metrics."""
@@ -413,15 +449,19 @@ class TrajectoryFollower:
         if measured is None:
             requirement = "must come first: a trajectory begins there"
             raise refusal("joint_trajectory", "joint_states", None, requirement)
-        named = self._model.initial.orientation
-        meant = None if named is None else rotation_matrix(named)
-        assembly = kinematics.admissible(self._geometry, measured.gamma, meant)
+        rotation = None  # that names the assembly, where the scene does
+        if self._model.initial.orientation is not None:
+            rotation = rotation_matrix(self._model.initial.orientation)
+        assembly = kinematics.admissible(self._geometry, measured.gamma, rotation)
         x, y, z, w = quaternion_of(assembly.rotation).tolist()
         return Reference((x, y, z, w), ZERO, ZERO, measured.gamma, ZERO, ZERO)
 
     def _refuse_elsewhere(self, measured: Measurement) -> None:
-        begin, tolerance = self._motion.at(0.0).gamma, self._settings.start_tolerance
-        is_near = max(map(abs, axpy(1.0, begin, -1.0, measured.gamma))) <= tolerance
+        """Raise InputError where the manipulator is not where the motion begins."""
+        begin = self._motion.at(0.0).gamma
+        tolerance = self._settings.start_tolerance
+        distances = map(abs, axpy(1.0, begin, -1.0, measured.gamma))
+        is_near = max(distances) <= tolerance
         begin_text = ", ".join(f"{angle:.6f}" for angle in begin)
         requirement = (
             f"must be within {tolerance:g} rad of ({begin_text}), where the motion"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from enum import IntEnum
 from functools import partial
 from operator import attrgetter
@@ -24,7 +25,7 @@ from sst_ros.errors import Check, refuse_unless
 from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.runtime.settings import ControllerNodeParameters
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS
+from sst_ros.scene.loads import ACTUATED_JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import NANOSECONDS, ZERO, Vector3, nanoseconds
 
@@ -201,30 +202,31 @@ class TrajectoryGoal:
     """
 
     def __init__(self, message: Any, defaults: ControllerNodeParameters) -> None:
-        names = (
+        self._checks: list[Check] = []
+        for name in (
             "multi_dof_trajectory.joint_names",
             "multi_dof_trajectory.points",
             "component_path_tolerance",
             "component_goal_tolerance",
-        )
-        rows, requirement = (
-            attrgetter(*names)(message),
-            "must be empty: joints have one freedom",
-        )
-        self._checks: list[Check] = [
-            (name, f"{len(x)} entries", not x, requirement)
-            for name, x in zip(names, rows, strict=True)
-        ]
+        ):
+            entries = attrgetter(name)(message)
+            requirement = "must be empty: joints have one freedom"
+            count = f"{len(entries)} entries"
+            self._checks.append((name, count, not entries, requirement))
         self._path = self._resolve_all(
             message, "path_tolerance", defaults.path_tolerance, 0.0
         )
-        still = defaults.stopped_velocity_tolerance
         self._goal = self._resolve_all(
-            message, "goal_tolerance", defaults.goal_tolerance, still
+            message,
+            "goal_tolerance",
+            defaults.goal_tolerance,
+            defaults.stopped_velocity_tolerance,
         )
-        name = "goal_time_tolerance"
-        late = nanoseconds(message.goal_time_tolerance) / NANOSECONDS
-        self._late = self._resolve(name, late, defaults.goal_time_tolerance)
+        self._late = self._resolve(
+            "goal_time_tolerance",
+            nanoseconds(message.goal_time_tolerance) / NANOSECONDS,
+            defaults.goal_time_tolerance,
+        )
         refuse_unless("follow_joint_trajectory", *self._checks)
         points = message.trajectory.points
         self._times = [
@@ -234,38 +236,38 @@ class TrajectoryGoal:
     def _resolve_all(
         self, message: Any, name: str, position: float, velocity: float
     ) -> dict[tuple[str, str], float]:
-        """Largest error by quantity and actuator [rad], [rad/s].
+        """Return the largest error by quantity and actuator [rad], [rad/s].
 
-        0 where there is none.
+        It is 0 where there is none. The defaults are those of a position and of a
+        velocity.
         """
-        own = {"position": position, "velocity": velocity}
-        tolerances = {
-            (quantity, joint): own[quantity]
-            for quantity in own
-            for joint in ACTUATED_JOINTS
-        }
+        defaults = {"position": position, "velocity": velocity}
+        tolerances: dict[tuple[str, str], float] = {}
+        for quantity, default in defaults.items():
+            for joint in ACTUATED_JOINTS:
+                tolerances[quantity, joint] = default
         for index, tolerance in enumerate(getattr(message, name)):
             place = f"{name}[{index}]"
-            is_joint, requirement = (
-                tolerance.name in ACTUATED_JOINTS,
-                f"must be one of {', '.join(ACTUATED_JOINTS)}",
-            )
+            is_joint = tolerance.name in ACTUATED_JOINTS
+            requirement = f"must be one of {', '.join(ACTUATED_JOINTS)}"
             self._checks.append(
                 (f"{place}.name", tolerance.name, is_joint, requirement)
             )
-            for quantity, default in own.items():
+            for quantity, default in defaults.items():
                 value = getattr(tolerance, quantity)
                 resolved = self._resolve(f"{place}.{quantity}", value, default)
                 tolerances[quantity, tolerance.name] = resolved
         return tolerances
 
     def _resolve(self, name: str, value: float, default: float) -> float:
-        none, requirement = (
-            value == NO_TOLERANCE,
-            "must be > 0, 0 for the default or -1 for none",
-        )
-        self._checks.append((name, value, none or 0.0 <= value < math.inf, requirement))
-        return 0.0 if none else value or default
+        """Return a tolerance, its default where the message has 0, and 0 for none."""
+        is_none = value == NO_TOLERANCE
+        is_allowed = is_none or 0.0 <= value < math.inf
+        requirement = "must be > 0, 0 for the default or -1 for none"
+        self._checks.append((name, value, is_allowed, requirement))
+        if is_none:
+            return 0.0
+        return value or default
 
     def index(self, time: float) -> int:
         """Return the index of the point approached at a time of the motion [s]."""
@@ -279,24 +281,31 @@ class TrajectoryGoal:
         The time is that of the motion [s], the errors are desired - measured [rad],
         [rad/s].
         """
+        errors = (*error, *error_rate)
         late = time - self._times[-1]
-        stretch, tolerances = (
-            ("path", self._path) if late < 0.0 else ("goal", self._goal)
-        )
-        errors, unmet = (*error, *error_rate), ""
-        for ((quantity, joint), tolerance), off in zip(
-            tolerances.items(), errors, strict=True
-        ):
-            if tolerance and not abs(off) <= tolerance:
-                unit = "rad" if quantity == "position" else "rad/s"
-                violated = f"{stretch} tolerance {tolerance:g} {unit}"
-                unmet = f"{joint}: {quantity} error {off:.6g} {unit}, {violated}"
-                break
         if late < 0.0:
+            unmet = _find_unmet("path", self._path, errors)
             return (ErrorCode.PATH_TOLERANCE_VIOLATED, unmet) if unmet else None
+        unmet = _find_unmet("goal", self._goal, errors)
         if not unmet:
             return ErrorCode.SUCCESSFUL, "goal reached"
         if not 0.0 < self._late < late:
             return None
         when = f"{late:.3f} s after the end, goal_time_tolerance {self._late:g} s"
         return ErrorCode.GOAL_TOLERANCE_VIOLATED, f"{unmet} {when}"
+
+
+def _find_unmet(
+    stretch: str, tolerances: dict[tuple[str, str], float], errors: Sequence[float]
+) -> str:
+    """Describe the first error beyond its tolerance, "" for none.
+
+    Errors are in the order of the tolerances; a tolerance of 0 is none.
+    """
+    rows = zip(tolerances.items(), errors, strict=True)
+    for ((quantity, joint), tolerance), error in rows:
+        if tolerance and not abs(error) <= tolerance:
+            unit = "rad" if quantity == "position" else "rad/s"
+            violated = f"{stretch} tolerance {tolerance:g} {unit}"
+            return f"{joint}: {quantity} error {error:.6g} {unit}, {violated}"
+    return ""

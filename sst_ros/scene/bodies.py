@@ -22,6 +22,13 @@ from sst_ros.scene.schema import Rules, Section, amount, choice, coefficient, en
 from sst_ros.state import ZERO, Array, Vector3
 
 RELATIVE_ROUNDING = 1e-9
+"""Share by which numbers of a document may miss a bound that they are on."""
+
+SHIFT_ROUNDING = 1e-6
+"""Share of the largest moment by which moments about a centre of mass may miss a bound.
+
+They are small differences of large numbers, which the document has rounded.
+"""
 
 SMALLEST_SIDE = 4e-5
 """Side [rad] of an equilateral base whose volume is lost in RELATIVE_ROUNDING."""
@@ -61,7 +68,8 @@ class Inertia(Section):
     def rules(self) -> Rules:
         """Refuse what no rigid body has."""
         tensor = entries_of(self)
-        trace = sum(tensor[:3])
+        xx, yy, zz, *_ = tensor
+        trace = xx + yy + zz
         # A moment that equals the sum of the other two is half the trace.
         largest = (1.0 + RELATIVE_ROUNDING) / (2.0 + RELATIVE_ROUNDING) * trace
         definite = _is_positive(tensor, -SMALLEST_MOMENT * (1.0 - RELATIVE_ROUNDING))
@@ -199,7 +207,8 @@ class Link(Section):
         # Moments about the centre of mass: none exceeds half their sum, but for
         # rounding.
         about_centre = shift_inertia(self.inertia, -self.mass, self.centre)
-        largest = 0.5 * sum(about_centre[:3]) + 0.5e-6 * scale
+        xx, yy, zz, *_ = about_centre
+        largest = 0.5 * (xx + yy + zz) + 0.5 * (SHIFT_ROUNDING * scale)
         fits = _is_positive([-moment for moment in about_centre], largest)
         has_mass = np.greater(self.mass, 0.0) & np.greater(scale, 0.0)
         requirement = (
@@ -327,7 +336,8 @@ def shift_inertia(inertia: Inertia | None, mass: Any, centre: Any) -> list[Any]:
 
     They are shifted by parallel axes. They may be columns.
     """
-    square = centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]
+    x, y, z = centre
+    square = x * x + y * y + z * z
     shifted = []
     for moment, (i, j) in zip(entries_of(inertia), PLACES, strict=True):
         point_mass = mass * (square * float(i == j) - centre[i] * centre[j])

@@ -20,6 +20,8 @@ from sst_ros.state import ZERO, Quaternion, Vector3
 JOINTS = tuple(
     f"{angle}_{leg}" for angle in ("gamma", "mu", "beta") for leg in (1, 2, 3)
 )
+ACTUATED_JOINTS = JOINTS[:3]
+PASSIVE_JOINTS = JOINTS[3:]
 MOMENTS = ("moment_x", "moment_y", "moment_z")  # beside the torques of a tick
 NANOSECOND = 1e-9  # resolution of time [s]
 _duration = partial(entry, "time that it takes", "s", least=NANOSECOND)

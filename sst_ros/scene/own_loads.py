@@ -12,17 +12,16 @@ from __future__ import annotations
 import ast
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable
 from functools import lru_cache
 
+from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.schema import Rules, Section, choice, entry
 
 ROTATION = tuple(f"R{i}{j}" for i in "123" for j in "123")
 """Entries of R, the orientation of {E} in {B}: R13, R23, R33 is the direction of E."""
 
-ANGLE_NAMES = tuple(
-    f"{angle}_{leg}" for angle in ("gamma", "mu", "beta") for leg in (1, 2, 3)
-)
+ANGLE_NAMES = JOINTS
 # angular velocity of the star in {B} [rad/s]
 OMEGA = tuple(f"omega_{axis}" for axis in "xyz")
 BODY_RATE = tuple(f"body_rate_{axis}" for axis in "xyz")  # the same in {E}
@@ -243,7 +242,7 @@ def power_of(node: ast.BinOp) -> int | None:
     return sign * exponent.value
 
 
-def names_in(texts: Iterator[str]) -> set[str]:
+def names_in(texts: Iterable[str]) -> set[str]:
     """Return the names that formulas use, those of functions left out."""
     names = set()
     for text in texts:

@@ -41,6 +41,9 @@ A larger one is a slip of units, and its powers leave double precision.
 """
 
 
+MOST_FAULTS = 10
+"""Problems of scenarios in one message, and rows that are examined for it."""
+
 LINKS = ("actuated_links", "intermediate_links")
 
 
@@ -379,8 +382,8 @@ class Scenarios:
         }
         return schema.rebuild(self.document, columns)
 
-    def faults(self, most: int = 10) -> dict[int, InputError]:
-        """Rows that make no scene, and why; no more than `most` rows are looked for."""
+    def faults(self, most: int = MOST_FAULTS) -> dict[int, InputError]:
+        """Return the rows that make no scene, `most` at most, and why each does not."""
         faults: dict[int, InputError] = {}
         for row in np.flatnonzero(self._doubtful()).tolist():
             try:
@@ -409,12 +412,12 @@ class Scenarios:
         return np.asarray(doubtful)
 
     def check(self) -> None:
-        """Raise InputError with the first ten problems if rows make no scene."""
+        """Raise InputError with the first problems if rows make no scene."""
         problems: list[Problem] = []
         for error in self.faults().values():
             problems += error.problems
         if problems:
-            raise InputError(self.document.name, problems[:10])
+            raise InputError(self.document.name, problems[:MOST_FAULTS])
 
 
 def _columns(values: Array) -> Any:

@@ -50,7 +50,7 @@ _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 # no initial or desired angle of an actuator [rad] is larger: it is in degrees
 FULL_TURN = 2.0 * math.pi
 REQUIRED: Any = object()  # default of a field that must be given
-Place = tuple[str | int, ...]  # names and indices of a part of a tree from the root on
+Place = tuple[str | int, ...]  # names and indices from the root of a tree to a part
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ class Section:
             declared = vars(cls).get(name)
             if not isinstance(declared, Field) or declared.default is not MISSING:
                 continue
-            if str(hint).endswith("| None"):
+            if str(hint).endswith("| None"):  # may be left out
                 declared.default = None
         dataclass(frozen=True, repr=not issubclass(cls, Explained))(cls)
         hints = typing.get_type_hints(cls)
@@ -230,7 +230,7 @@ class Section:
         cls.SPECS = specs
 
     def __post_init__(self) -> None:
-        values = []
+        values = []  # to be checked
         for name, spec in self.SPECS.items():
             value = getattr(self, name)
             # None is allowed where it is the default: then the field is left out.
@@ -551,7 +551,9 @@ def _freeze_samples(spec: Spec, value: Any) -> Array:
     array = freeze(real_numbers(value, seconds=spec.unit == "s"))
     fits = array.ndim > 0 and array.shape[1:] == spec.shape
     refuse_unless("", ("", array.shape, fits, spec.describe()))
-    for place in np.argwhere(~np.isfinite(array))[:1].tolist():
+    bad_places = np.argwhere(~np.isfinite(array)).tolist()
+    if bad_places:
+        place = bad_places[0]
         raise refusal("", str(place), float(array[tuple(place)]), "must be finite")
     return array
 

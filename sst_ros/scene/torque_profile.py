@@ -48,7 +48,8 @@ TorqueFunction: TypeAlias = (
 )
 """Torques [N m] at a time [s], or at a time and a state."""
 
-# radians of a sine beyond which its clamping is not computed in advance
+# radians of a sine beyond which its clamping is not computed in advance: there would be
+# some 1e5 times, each the begin of a step
 _MOST_CROSSINGS = 1e5
 
 
@@ -130,13 +131,13 @@ class LostTorque(TorqueProfile):
 class ConstantTorque(TorqueProfile):
     """The same three torques [N m] at all times.
 
-    InputError is raised where they are none.
+    InputError is raised for anything but three finite numbers.
     """
 
     kind = "constant"
 
     def __init__(self, torque: Any) -> None:
-        self.torque = _three(torque, "torque")
+        self.torque = _three_numbers(torque, "torque")
 
     @property
     def held(self) -> Vector3:  # type: ignore[override]
@@ -279,10 +280,12 @@ class _PolynomialPiece(TorqueProfile):
     def at(self, time: float, *state: State) -> Vector3:
         """See `TorqueProfile`."""
         x = time - self._start
-        total = ZERO
-        for a, b, c in self._rows:
-            total = total[0] * x + a, total[1] * x + b, total[2] * x + c
-        return total
+        first, second, third = ZERO
+        for a, b, c in self._rows:  # Horner's scheme
+            first = first * x + a
+            second = second * x + b
+            third = third * x + c
+        return first, second, third
 
     def values(self, t: Array) -> Array:
         """See `TorqueProfile`."""
@@ -341,7 +344,7 @@ def _are_plain_vectors(values: Sequence[Any]) -> bool:
     return set(map(type, numbers)) == {float} and math.isfinite(sum(numbers))
 
 
-def _three(value: Any, name: str) -> Vector3:
+def _three_numbers(value: Any, name: str) -> Vector3:
     """Return three finite numbers as floats, or refuse them."""
     vector = finite_vector(value)
     if vector is not None:
@@ -473,9 +476,9 @@ class TorqueTable(TorqueProfile):
         says why the file cannot be read, or lists every bad row with its line.
         """
         origin = str(path)
-        unread = OSError, UnicodeDecodeError, csv.Error
+        reading_errors = (OSError, UnicodeDecodeError, csv.Error)
         with (
-            refuse_errors(origin, "csv", origin, "must be readable", *unread),
+            refuse_errors(origin, "csv", origin, "must be readable", *reading_errors),
             open_table(Path(path)) as file,
         ):
             reader = csv.reader(file)

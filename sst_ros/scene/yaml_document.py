@@ -255,23 +255,25 @@ def replace_values(document: Any, values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _set(tree: Any, place: Place, value: Any) -> None:
     """Set a value at a place of a tree; a name in a list means that of each entry."""
-    name = place[0]
-    below = place[1:]
+    name, *inner_place = place
     if isinstance(tree, list) and isinstance(name, str):
         for entry in tree:
             _set(entry, place, value)
-    elif below:
-        subtree = tree.setdefault(name, {}) if isinstance(name, str) else tree[name]
-        _set(subtree, below, value)
-    elif value is None and isinstance(name, str):
+        return
+    if inner_place:
+        if isinstance(name, str):
+            tree.setdefault(name, {})
+        _set(tree[name], tuple(inner_place), value)
+        return
+    if value is None and isinstance(name, str):
         tree.pop(name, None)
+        return
+    current = tree.get(name) if isinstance(name, str) else tree[name]
+    is_single = not isinstance(value, (str, list, tuple, Mapping))
+    if isinstance(current, list) and is_single:
+        tree[name] = [value] * len(current)
     else:
-        current = tree.get(name) if isinstance(name, str) else tree[name]
-        single = not isinstance(value, (str, list, tuple, Mapping))
-        if isinstance(current, list) and single:
-            tree[name] = [value] * len(current)
-        else:
-            tree[name] = value
+        tree[name] = value
 
 
 def _split(key: str) -> Place:
@@ -334,15 +336,14 @@ def _below(
     if value is None:
         raise ValueError(f"the scene has no {place[-1]}")
     if spec.kind == "sections":
-        indices = [step] if isinstance(step, int) else range(len(value))
-        if not indices or indices[-1] >= len(value):
+        if not value or (isinstance(step, int) and step >= len(value)):
             raise ValueError(f"the scene has {len(value)} {place[-1]}")
-        for i in indices:
-            entry = (*place, i), value[i], replace(spec, kind="section")
-            if i == step:
-                yield entry
-            else:
-                yield from _below(*entry, step, components)
+        section = replace(spec, kind="section")
+        if isinstance(step, int):
+            yield (*place, step), value[step], section
+            return
+        for i, entry in enumerate(value):
+            yield from _below((*place, i), entry, section, step, components)
     elif spec.kind == "section" and isinstance(step, str):
         specs = value.SPECS
         if step not in specs:

@@ -33,7 +33,7 @@ from sst_ros.mechanism.generic_math import axpy, cos, dot3, log, positive, selec
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.programs.columns import ColumnFunction, compile_columns
 from sst_ros.programs.expression import Expression, divide, trace
-from sst_ros.state import cached_property
+from sst_ros.state import NANOSECONDS, TORQUES, cached_property
 from sst_ros.sweeps.sweep_study import SampledControl, SweepStudy
 
 CONTROL_NEWTON_STEPS = 5
@@ -43,7 +43,11 @@ Each squares the error, which is small from one sample to the next.
 """
 
 REFERENCES = {"first": 1, **REFERENCE_SIZES, "feedforward": 3, "held": 3}
-"""Sizes of a sample's inputs: whether it is the first, the reference, its torques."""
+"""Sizes of a sample's inputs.
+
+They are whether it is the first, the reference, and the torques of the desired motion,
+now and at the instant whose torque is held.
+"""
 
 GAINS = {
     "kp": 3,
@@ -81,9 +85,8 @@ def uniform_numbers(
 
     They are uniform between 0 and 1, a pair for each normal number.
     """
-    numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + np.uint64(
-        2 * normal * sample
-    )
+    earlier = np.uint64(2 * normal * sample)
+    numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + earlier
     bits = _mix(starts + (numbers * _SPLITMIX_STEP)[:, None])
     uniform: Array = ((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
     return uniform
@@ -123,8 +126,8 @@ class ControlledBlock(Block):
         self._feedback = feedback
         self._memory = np.zeros((len(feedback.memory), width))
         self._gains = np.zeros((len(feedback.gains), width))
-        noise = 2 * _NOISE if len(feedback.starts) else 0
-        self._uniform = np.zeros((noise, width))
+        has_noise = len(feedback.starts) > 0
+        self._uniform = np.zeros((2 * _NOISE if has_noise else 0, width))
         self._starts = np.zeros((1, width), dtype=np.uint64)
         inputs = [
             *self._memory,
@@ -133,7 +136,7 @@ class ControlledBlock(Block):
             *self._gains,
             self.running,
         ]
-        results = [*self.given[:3], *self._memory]
+        results = [*self.given[TORQUES], *self._memory]
         self._answer = [
             feedback.answer.bind([*self.states(which), *inputs], results)
             for which in (0, 1)
@@ -150,10 +153,10 @@ class ControlledBlock(Block):
     def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
         """Put states, errors, torques and memory back."""
         super().store(columns_of_block, *columns)
-        given = columns[1]
+        _, drives, code, *_ = columns
         memory = self._feedback.memory
-        number = len(columns[2][columns_of_block])
-        given[:3, columns_of_block] = self.given[:3, :number]
+        number = len(code[columns_of_block])  # the last block may have fewer
+        drives[TORQUES, columns_of_block] = self.given[TORQUES, :number]
         memory[:, columns_of_block] = self._memory[:, :number]
 
     def prepare_step(self, number: int) -> None:
@@ -196,14 +199,14 @@ class ControlledBatch:
         self._controller = Controller(self._scene, self._motion, control, period)
         varied = {variation.key for variation in study.variations}
 
-        def has(*names: str) -> bool:
-            return any(
-                getattr(control, name) or f"control.{name}" in varied for name in names
-            )
+        def has(name: str) -> bool:
+            """Return whether a setting acts in some scenario."""
+            return bool(getattr(control, name)) or f"control.{name}" in varied
 
         limits = self._scene.torque_limit, batch.scene.torque_limit
         self._limited = has("torque_limit") or any(limits)
-        self._noise = _NOISE if has("angle_noise", "rate_noise") else 0
+        has_noise = has("angle_noise") or has("rate_noise")
+        self._noise = _NOISE if has_noise else 0
         self._memory_sizes = {
             "integral": 3 if has("integral_rate") else 0,
             "queue": 3 * control.delay,
@@ -230,17 +233,19 @@ class ControlledBatch:
             "y": len(model.ode.state),
             "memory": sum(self._memory_sizes.values()),
             "uniform": 2 * self._noise,
-            "given": drives + len(model.names),
+            "sent": 3,
+            "other_drives": drives - 3,
+            "varied": len(model.names),
             "gains": sum(GAINS.values()),
             "running": 1,
         }
 
         def respond(*inputs: Expression) -> tuple[Any, ...]:
-            of = divide(sizes, inputs)
-            plant = model.constants(of["given"][drives:]).model
-            new = self._command(kernel.joints(plant, of["y"]), of)
-            old = (*of["given"][:3], *of["memory"])
-            running = of["running"][0]
+            numbers = divide(sizes, inputs)
+            plant = model.constants(numbers["varied"]).model
+            new = self._command(kernel.joints(plant, numbers["y"]), numbers)
+            old = (*numbers["sent"], *numbers["memory"])
+            (running,) = numbers["running"]
             return tuple(
                 select(running, *choices) for choices in zip(new, old, strict=True)
             )
@@ -248,63 +253,95 @@ class ControlledBatch:
         program = trace(respond, [f"i{j}" for j in range(sum(sizes.values()))])
         return compile_columns({"answer": program}, sizes["references"])["answer"]
 
-    def _command(self, joints: Any, of: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Return what law and channel send, three torques, and the new memory."""
+    def _command(self, joints: Any, numbers: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return what law and channel send, three torques, and the new memory.
+
+        The joints are those of the plant, the numbers the other inputs of `answer`.
+        """
         control = self._control
         space = ActuatorSpaceMap(Geometry.of(self._scene))
-        reference = divide(REFERENCES, of["references"])
-        gains = divide(GAINS, of["gains"])
-        memory = divide(self._memory_sizes, of["memory"])
-        new = dict(memory)
-        angle, rate = gains["noise"]
-        pairs = zip(of["uniform"][::2], of["uniform"][1::2], strict=True)
-        noise = (normal_number(u, v) for u, v in pairs)
-        deviations = (angle,) * 3 + (rate,) * 3
-        scaled = [n * by for n, by in zip(noise, deviations, strict=False)]
-        exact = joints.gamma, joints.gamma_dot
-        gamma, gamma_dot, new["before"] = control.measure(
-            *exact, memory["before"], scaled
+        reference = divide(REFERENCES, numbers["references"])
+        gains = divide(GAINS, numbers["gains"])
+        memory = divide(self._memory_sizes, numbers["memory"])
+        noise = self._scale_noise(numbers["uniform"], gains["noise"])
+        gamma, gamma_dot, encoder_angles = control.measure(
+            joints.gamma, joints.gamma_dot, memory["before"], noise
         )
-        if observed := memory["observed"]:  # in the last assembly mode
+        observed = memory["observed"]
+        if observed:  # in the last assembly mode
             carriages = space.carriages(gamma)
             for _ in range(CONTROL_NEWTON_STEPS):
-                observed = space.newton_step(*observed, *carriages)[:4]
+                x, y, z, w, *_ = space.newton_step(*observed, *carriages)
+                observed = (x, y, z, w)
         desired = Reference(**{name: reference[name] for name in REFERENCE_SIZES})
-        limit = gains["limit"][0] if self._limited else None
-        numbers = gains["kp"], gains["kd"], gains["inertia"], gains["rate"][0], limit
-
-        def torque(*at: Any) -> Any:
-            return kernel.actuator_torque(kernel.model_of(self._scene), *at)[0]
-
         scheme = law.ControlLaw(
-            control, torque, space.star_accelerations, *numbers, control.period
+            control,
+            self._inverse_dynamics,
+            space.star_accelerations,
+            gains["kp"],
+            gains["kd"],
+            gains["inertia"],
+            gains["rate"][0],
+            gains["limit"][0] if self._limited else None,
+            control.period,
         )
         ahead = reference["feedforward"], reference["held"]
         answer = scheme.answer(
             desired, ahead, gamma, gamma_dot, observed, memory["integral"]
         )
-        sent, new["queue"] = control.transmit(
+        sent, queue = control.transmit(
             answer.torque, memory["queue"], reference["first"][0]
         )
+        limited = memory["limited"]
         if self._limited:
             cut = axpy(1.0, answer.total, -1.0, answer.torque)
-            new["limited"] = (memory["limited"][0] + law.is_above(dot3(cut, cut)),)
+            limited = (limited[0] + law.is_above(dot3(cut, cut)),)
             sent = law.bound(sent, gains["plant_limit"][0])
-        off = axpy(1.0, desired.gamma, -1.0, joints.gamma)
-        new |= {"observed": observed, "integral": answer.integral}
-        squares = zip(memory["squares"], (*off, *sent), strict=True)
-        new["squares"] = tuple(s + e * e for s, e in squares)
-        # The larger of the largest yet and of |e|, without a branch.
-        largest = zip(memory["largest"], (*off, *sent), strict=True)
-        new["largest"] = tuple(
-            s + positive(positive(e) + positive(-e) - s) for s, e in largest
-        )
-        count = memory["samples"][0]
-        last = memory["unsettled"][0]
-        beyond = [positive(e - self._band) + positive(-e - self._band) for e in off]
-        new["samples"] = (count + 1.0,)
-        new["unsettled"] = (last + law.is_above(sum(beyond)) * (count + 1.0 - last),)
+        error = axpy(1.0, desired.gamma, -1.0, joints.gamma)
+        new = {
+            "integral": answer.integral,
+            "queue": queue,
+            "before": encoder_angles,
+            "observed": observed,
+            "limited": limited,
+            **self._score(memory, error, sent),
+        }
         return (*sent, *(number for name in self._memory_sizes for number in new[name]))
+
+    def _inverse_dynamics(self, *motion: Any) -> Any:
+        torque, _ = kernel.actuator_torque(kernel.model_of(self._scene), *motion)
+        return torque
+
+    def _scale_noise(self, uniform: Sequence[Any], deviations: Sequence[Any]) -> Any:
+        """Return noise of three angles and three rates, of pairs of uniform numbers."""
+        angle, rate = deviations
+        noise = []
+        for k in range(self._noise):
+            u, v = uniform[2 * k : 2 * k + 2]
+            deviation = angle if k < 3 else rate
+            noise.append(normal_number(u, v) * deviation)
+        return noise
+
+    def _score(
+        self, memory: Mapping[str, Any], error: Any, sent: Any
+    ) -> dict[str, tuple[Any, ...]]:
+        """Return the sums of tracking errors [rad] and torques [N m] with a sample."""
+        scored = (*error, *sent)
+        squares = zip(memory["squares"], scored, strict=True)
+        # The larger of the largest yet and of |x|, without a branch.
+        largest = zip(memory["largest"], scored, strict=True)
+        (count,) = memory["samples"]
+        (last,) = memory["unsettled"]
+        outside = [positive(x - self._band) + positive(-x - self._band) for x in error]
+        return {
+            "squares": tuple(total + x * x for total, x in squares),
+            "largest": tuple(
+                most + positive(positive(x) + positive(-x) - most)
+                for most, x in largest
+            ),
+            "samples": (count + 1.0,),
+            "unsettled": (last + law.is_above(sum(outside)) * (count + 1.0 - last),),
+        }
 
     def run(
         self,
@@ -320,68 +357,92 @@ class ControlledBatch:
         rows of the scenarios in their study; `steps` is a multiple of `samples`.
         """
         count = len(rows)
-        hold = steps // self.samples
         start = self._motion.at(0.0)
-        control = self._control
         gamma = varied.get("initial.gamma", np.tile(start.gamma, (count, 1)))
         rate = varied.get("initial.gamma_dot", np.tile(start.gamma_dot, (count, 1)))
-        memory = np.zeros((sum(self._memory_sizes.values()), count))
-        blocks = divide(self._memory_sizes, memory)  # views of its rows
-        earlier: Any = ()
-        if control.counts:  # encoder angles a period before the start
-            earlier = control.count(gamma - control.period * rate).T
-        for name, values in (("observed", start.quaternion), ("before", earlier)):
-            for place, value in zip(blocks[name], values, strict=False):
-                place[:] = value
+        memory = self._start_memory(start, gamma, rate)
         noise = np.zeros(0, dtype=np.uint64)
         if self._noise:
             noise = streams(self._seed, rows)
-        samples = [tuple(row) for row in self._references.tolist()]
-        gains = self._make_gains(batch, varied, count)
-        feedback = Feedback(self.answer, samples, hold, memory, gains, noise)
+        feedback = Feedback(
+            answer=self.answer,
+            references=[tuple(row) for row in self._references.tolist()],
+            hold=steps // self.samples,
+            memory=memory,
+            gains=self._make_gains(batch, varied, count),
+            starts=noise,
+        )
         width = block_width(count)
-        drives = [np.zeros((3, count))]  # torques that were sent before each kept state
+        sent = [np.zeros((3, count))]  # torques that were sent before each kept state
 
         def advance(
-            first: int, number: int, step: float, *arrays: Any, rows: Any
+            first: int, number: int, step: float, *columns: Any, rows: Any
         ) -> None:
             if rows is not None:  # torques are held while a step is repeated
-                batch.advance(first, number, step, *arrays, threads=1)
+                batch.advance(first, number, step, *columns, threads=1)
                 return
             block = ControlledBlock(batch.programs, width, feedback)
-            advance_blocks(block, range(0, count, width), first, number, step, *arrays)
+            advance_blocks(block, range(0, count, width), first, number, step, *columns)
             if kept and (first + number) % kept == 0:
-                drives.append(arrays[1][:3].copy())
+                _, drives, *_ = columns
+                sent.append(drives[TORQUES].copy())
 
-        step = self.samples * control.period / steps
+        step = self.samples * self._control.period / steps
         result = batch.run(
             gamma, rate, step=step, count=steps, keep_every=kept, advance=advance
         )
         if result.kept is not None:
-            result.kept.sent = np.moveaxis(np.stack(drives), 1, -1)
-        # Root of the mean square and largest error of gamma [rad] at the samples of a
-        # run and its end, and of the torque [N m]; when the error of all joints is in
-        # the band for good [s].
-        final = (
-            np.array(divide(REFERENCES, self._references[-1])["gamma"]) - result.gamma
-        )
+            result.kept.sent = np.moveaxis(np.stack(sent), 1, -1)
+        return result, self._tracking_figures(result, memory)
+
+    def _start_memory(self, start: Reference, gamma: Array, rate: Array) -> Array:
+        """Return the memory before the first sample, a column a scenario."""
+        control = self._control
+        memory = np.zeros((sum(self._memory_sizes.values()), len(gamma)))
+        rows = divide(self._memory_sizes, memory)  # views
+        if control.observes:
+            for row, component in zip(rows["observed"], start.quaternion, strict=True):
+                row[:] = component
+        if control.counts:  # encoder angles a period before the start
+            earlier = control.count(gamma - control.period * rate)
+            for row, angle in zip(rows["before"], earlier.T, strict=True):
+                row[:] = angle
+        return memory
+
+    def _tracking_figures(self, result: BatchResult, memory: Array) -> dict[str, Array]:
+        """Return how closely the scenarios followed the reference.
+
+        The figures are the root of the mean square and the largest error of gamma [rad]
+        at the samples of a run and its end, and of the torque [N m]; when the error of
+        all joints is in the band for good [s].
+        """
+        rows = divide(self._memory_sizes, memory)
+        desired = np.array(divide(REFERENCES, self._references[-1])["gamma"])
+        final = desired - result.gamma
         complete = result.success[:, None]
-        last = np.hstack([np.where(complete, final, 0.0), np.zeros((count, 3))])
-        largest = np.maximum(np.stack(blocks["largest"], axis=1), np.abs(last))
-        squares = np.stack(blocks["squares"], axis=1) + last**2
-        begun = np.floor(result.t / control.period + 1e-9)[:, None]
+        no_torque = np.zeros_like(final)
+        last = np.hstack([np.where(complete, final, 0.0), no_torque])
+        largest = np.maximum(np.stack(rows["largest"], axis=1), np.abs(last))
+        squares = np.stack(rows["squares"], axis=1) + last**2
+        begun = np.floor(result.t / self._control.period + 1e-9)[:, None]
         sample_counts = np.hstack([begun + 1.0] * 3 + [begun + ~complete] * 3)
-        figures = {"rms": np.sqrt(squares / sample_counts), "max": largest}
-        table = {
-            f"{quantity}_{name}_{k + 1}": x[:, 3 * offset + k]
-            for offset, quantity in enumerate(("error", "torque"))
-            for name, x in figures.items()
-            for k in range(3)
+        error_rms, torque_rms = np.split(np.sqrt(squares / sample_counts), 2, axis=1)
+        error_max, torque_max = np.split(largest, 2, axis=1)
+        figures = {
+            "error_rms": error_rms,
+            "error_max": error_max,
+            "torque_rms": torque_rms,
+            "torque_max": torque_max,
         }
+        table = {}
+        for name, columns in figures.items():
+            for k in range(3):
+                table[f"{name}_{k + 1}"] = columns[:, k]
         settled = result.success & (np.abs(final).max(axis=1) <= self._band)
-        since = blocks["unsettled"][0] * control.period
+        since = rows["unsettled"][0] * self._control.period
         table["settling_time"] = np.where(settled, since, np.nan)
-        return result, table | {"limited_samples": blocks["limited"][0]}
+        table["limited_samples"] = rows["limited"][0]
+        return table
 
     @cached_property
     def _band(self) -> float:
@@ -393,24 +454,25 @@ class ControlledBatch:
     def _references(self) -> Array:
         """References of all samples of a run, shape (samples + 1, n)."""
         rows = []
+        period_ns = round(self._control.period * NANOSECONDS)
         for k in range(self.samples + 1):
-            time = k * round(self._control.period * 1e9) / 1e9
-            desired_state, *torques = self._controller.desire(time)
-            desired = (
-                number
-                for name in REFERENCE_SIZES
-                for number in getattr(desired_state, name)
-            )
-            rows.append((float(k == 0), *desired, *torques[0], *torques[1]))
+            time = k * period_ns / NANOSECONDS
+            reference, feedforward, held = self._controller.desire(time)
+            row = [float(k == 0)]  # in the order of REFERENCES
+            for name in REFERENCE_SIZES:
+                row += getattr(reference, name)
+            rows.append([*row, *feedforward, *held])
         return np.array(rows)
 
     def _make_gains(self, batch: Batch, varied: dict[str, Array], count: int) -> Array:
         """Return the gains, a column a scenario; see GAINS."""
 
         def value(name: str) -> Any:
+            """Return a setting; of a vector that varies, a row for each component."""
             nominal = getattr(self._control, name)
             values = varied.get(f"control.{name}", np.array(nominal))
-            return values.T if np.ndim(nominal) == 1 and values.ndim == 2 else values
+            is_varied_vector = np.ndim(nominal) == 1 and values.ndim == 2
+            return values.T if is_varied_vector else values
 
         inertia = np.array(self._controller.inertia)[:, None]
         varies = {"control.stiffness", "control.damping"} & varied.keys()
@@ -423,7 +485,8 @@ class ControlledBatch:
             value("angle_noise"),
             value("rate_noise"),
         )
-        shaped = (np.atleast_2d(row) for row in rows)
-        return np.concatenate(
-            [np.broadcast_to(row, (len(row), count)) for row in shaped]
-        )
+        columns = []
+        for row in rows:
+            components = np.atleast_2d(row)
+            columns.append(np.broadcast_to(components, (len(components), count)))
+        return np.concatenate(columns)

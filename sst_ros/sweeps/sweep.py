@@ -60,12 +60,22 @@ PILOT = 256
 Drawn apart, so that no number of rows matters.
 """
 
+PILOT_STEPS = 16  # that are tried first, at least
+PILOT_TRIES = 12  # numbers of steps that are tried
+ERROR_ORDER = 8.0  # power of the number of steps with which the error falls
+AIM = 0.7  # share of the tolerance that is aimed at
+GROWTH_OF_STEPS = (1.05, 8.0)  # least and largest, from one try to the next
+UNKNOWN_GROWTH = 4.0  # where the error is not finite
 MOST_RUN_STEPS = 1_000_000
+SHOWN_REASONS = 3  # for which runs ended early, beside the bar
+SHOWN_CAUSES = 8  # inputs on which that depends, in the summary
 
 EXTREMES = tuple(itertools.product(Joints._fields, ("min", "max")))
 REACTIONS = tuple(itertools.product(SIZES, LINK_JOINTS, ("peak", "rms")))
 
-METADATA = b"sst_ros"
+METADATA = b"sst_ros"  # key of what a Parquet file says of itself
+# what a row that makes no scene has; nan elsewhere
+_NO_SCENE = {"status": -1, "fault_time": 0.0}
 _NOT_OUTPUTS = ("status", "reason", "t", "fault_time", "local_error")
 
 
@@ -128,16 +138,18 @@ def sweep(
     refuse_unless(
         "sweep", ("vary", vary, has_text_keys, "must have keys of the scene, as text")
     )
-    rows = {"table" if hasattr(vary, "columns") else "vary": vary}
-    settings = {
-        "torque": torque,
-        "duration": duration,
-        "n": n,
-        "seed": seed,
-        **options,
-        **rows,
-    }
-    study = SweepStudy.from_values({"scene": scene, **settings})
+    is_table = hasattr(vary, "columns")
+    study = SweepStudy.from_values(
+        {
+            "scene": scene,
+            "torque": torque,
+            "duration": duration,
+            "n": n,
+            "seed": seed,
+            **options,
+            "table" if is_table else "vary": vary,
+        }
+    )
     return run_study(
         study,
         None if out is None else Path(out),
@@ -179,10 +191,8 @@ def run_study(
 def hold_folder(out: Path, origin: str) -> Iterator[None]:
     """Make the folder `out` for a block that alone writes into it.
 
-    Remove it if it stays empty.
-
-    Raises InputError of `origin` where another writer has it, in this process or
-    another.
+    It is removed if it stays empty. Raises InputError of `origin` where another writer
+    has it, in this process or another.
     """
     with write_into(out, origin):
         lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
@@ -238,10 +248,9 @@ def _compute(
             rate = max(runs / max(time.monotonic() - began, 1e-9), 1e-9)
             text = f"{rate:.0f} runs/s, {(total - runs) / rate:.0f} s left"
             if reasons:
-                common = (
-                    f"{count} {reason}" for reason, count in reasons.most_common(3)
-                )
-                text += f"; early: {', '.join(common)}"
+                common = reasons.most_common(SHOWN_REASONS)
+                counts = ", ".join(f"{count} {reason}" for reason, count in common)
+                text += f"; early: {counts}"
             bar.draw(1.0 - (total - runs) / study.rows, text)
     except OSError as error:
         raise SweepFailed(f"{out}: {error}") from error
@@ -259,10 +268,9 @@ def run_chunk(
     Raises OSError where the file cannot be written.
     """
     table = ready.chunk(index)
-    counts = {
-        row["values"]: row["counts"]
-        for row in table["reason"].value_counts().to_pylist()
-    }
+    counts = {}
+    for row in table["reason"].value_counts().to_pylist():
+        counts[row["values"]] = row["counts"]
     counts.pop("reached the end", None)
     if out is None:
         return counts, table
@@ -282,20 +290,18 @@ class PreparedSweep:
         self._ends, _ = self._split(find_range_ends(study))
         ends = Scenarios(study.model_scene, self._ends)
         for row, error in ends.faults(most=1).items():
-            texts = [
-                str(problem).replace(f"scenario {row}: ", "")
-                for problem in error.problems
-            ]
-            requirement = "within its range: " + "; ".join(texts)
+            problems = "; ".join(map(str, error.problems))
+            requirement = "within its range: " + problems.replace(
+                f"scenario {row}: ", ""
+            )
             raise refusal("sweep", "vary", "makes no scene", requirement)
         profile = study.model_scene.torque is not None
         self.batch = Batch(study.model_scene, profile=profile, parameters=ends.rows)
-        self.controlled = (
-            None if study.control is None else ControlledBatch(self.batch, study)
-        )
+        self.controlled: ControlledBatch | None = None
         # Compiled here, before several threads want it.
         _ = self.batch.programs
-        if self.controlled is not None:
+        if study.control is not None:
+            self.controlled = ControlledBatch(self.batch, study)
             _ = self.controlled.answer
         over_time = "extremes", "reactions"
         self._quantities = [name for name in study.outputs if name not in over_time]
@@ -311,22 +317,13 @@ class PreparedSweep:
         The error of c steps is the difference from 2c steps; it falls with the eighth
         power of c. It is nan where no run reaches the end.
         """
-        study = self.study
-        tolerance = study.tolerance
-        row_count = PILOT
-        sampling = "random"
-        if study.table is not None:
-            row_count = study.rows
-            sampling = study.sampling
-        spread = np.linspace(0, row_count - 1, min(PILOT, row_count))
-        chosen = spread.astype(int)
-        drawn = study.draw(0, row_count, sampling)
-        values = {key: numbers[chosen] for key, numbers in drawn.items()}
+        tolerance = self.study.tolerance
+        values = self._draw_pilot()
         scenarios, starts, _ = self.scenarios(values)
-        rows = np.arange(len(chosen))
+        rows = np.arange(_count_rows(values))
         unit = 1 if self.controlled is None else self.controlled.samples
-        count = max(unit, 16)
-        for _ in range(12):
+        count = max(unit, PILOT_STEPS)
+        for _ in range(PILOT_TRIES):
             coarse, _ = self.run(scenarios, starts, rows, count)
             fine, _ = self.run(scenarios, starts, rows, 2 * count)
             completed = coarse.success & fine.success
@@ -339,11 +336,12 @@ class PreparedSweep:
             self.pilot_error = error
             if error <= tolerance:
                 return count
-            factor = 4.0
+            growth = UNKNOWN_GROWTH
             if math.isfinite(error):
-                # Aim a little below the tolerance.
-                factor = (error / (0.7 * tolerance)) ** (1.0 / 8.0)
-            count = unit * math.ceil(count * min(max(factor, 1.05), 8.0) / unit)
+                growth = (error / (AIM * tolerance)) ** (1.0 / ERROR_ORDER)
+            least, most = GROWTH_OF_STEPS
+            growth = min(max(growth, least), most)
+            count = unit * math.ceil(count * growth / unit)
             if count > MOST_RUN_STEPS:
                 break
         requirement = (
@@ -352,84 +350,93 @@ class PreparedSweep:
         )
         raise refusal("sweep", "tolerance", tolerance, requirement)
 
+    def _draw_pilot(self) -> dict[str, Array]:
+        """Draw PILOT rows, or take so many from all over a table."""
+        study = self.study
+        if study.table is None:
+            return study.draw(0, PILOT, "random")
+        all_values = study.draw(0, study.rows)
+        spread = np.linspace(0, study.rows - 1, min(PILOT, study.rows))
+        chosen = spread.astype(int)
+        return {key: numbers[chosen] for key, numbers in all_values.items()}
+
     def check(self, values: dict[str, Array]) -> None:
         """Raise InputError with the first ten problems if rows make no scene."""
-        Scenarios(self.study.model_scene, self._split(values)[0]).check()
+        numbers, _ = self._split(values)
+        Scenarios(self.study.model_scene, numbers).check()
 
     @cached_property
     def about(self) -> dict[str, Any]:
         """Metadata of the files: study, its digest, version, units."""
-        units = MOTION_UNITS | {"fault_time": "s", "local_error": "1"}
-        for k in DIMENSIONS["leg"]:
-            joints = {
-                f"{name}_{end}_{k}": QUANTITIES[name][0] for name, end in EXTREMES
-            }
-            units |= {
-                f"{size}_{name}_{statistic}_{k}": SIZES[size]
-                for size, name, statistic in REACTIONS
-            }
-            units |= joints | {f"error_rms_{k}": "rad", f"error_max_{k}": "rad"}
-            units |= {
-                f"torque_rms_{k}": "N m",
-                f"torque_max_{k}": "N m",
-                "settling_time": "s",
-            }
+        inputs: list[str] = []
         for variation in self.study.variations:
-            units |= dict.fromkeys(
-                variation.columns,
-                "1" if variation.factor else variation.targets[0].spec.unit,
-            )
+            inputs += variation.columns
         return {
             "version": VERSION,
             "digest": self.study.digest,
             "steps": self.steps,
             "duration": self.study.length,
             "study": self.study.document(),
-            "units": units,
-            "inputs": [
-                name
-                for variation in self.study.variations
-                for name in variation.columns
-            ],
+            "units": self._units(),
+            "inputs": inputs,
         }
+
+    def _units(self) -> dict[str, str]:
+        """Return the units of all columns that a table may have."""
+        units = MOTION_UNITS | {"fault_time": "s", "local_error": "1"}
+        for leg in DIMENSIONS["leg"]:
+            for size, name, statistic in REACTIONS:
+                units[f"{size}_{name}_{statistic}_{leg}"] = SIZES[size]
+            for name, end in EXTREMES:
+                unit, _ = QUANTITIES[name]
+                units[f"{name}_{end}_{leg}"] = unit
+            units[f"error_rms_{leg}"] = "rad"
+            units[f"error_max_{leg}"] = "rad"
+            units[f"torque_rms_{leg}"] = "N m"
+            units[f"torque_max_{leg}"] = "N m"
+            units["settling_time"] = "s"
+        for variation in self.study.variations:
+            unit = "1" if variation.factor else variation.targets[0].spec.unit
+            units |= dict.fromkeys(variation.columns, unit)
+        return units
 
     def chunk(self, index: int) -> pa.Table:
         """Table of the rows of a chunk."""
         pyarrow = require("pyarrow")
         study = self.study
-        rows = np.arange(study.rows_of(index).start, study.rows_of(index).stop)
+        rows = np.array(study.rows_of(index))
         values = study.draw(int(rows[0]), len(rows))
         scenarios, starts, faults = self.scenarios(values)
         result, over_time = self.run(scenarios, starts, rows, self.steps)
-        columns: dict[str, NDArray[Any]] = {"status": result.status.astype(np.int8)}
-        columns |= {
-            name: getattr(result, name) for name in ("t", "fault_time", "local_error")
+        columns: dict[str, NDArray[Any]] = {"scenario": rows}
+        for variation in study.variations:
+            components = values[variation.key].T
+            columns.update(zip(variation.columns, components, strict=True))
+        outputs: dict[str, NDArray[Any]] = {
+            "status": result.status.astype(np.int8),
+            "t": result.t,
+            "fault_time": result.fault_time,
+            "local_error": result.local_error,
+            **result.columns(self._quantities),
+            **over_time,
         }
-        columns |= result.columns(self._quantities) | over_time
         texts, reason = result.reasons
         if faults:  # no numbers, and the first problem as the reason
-            wrong = list(faults)
-            keys = [
-                error.problems[0].key.partition(": ")[2] for error in faults.values()
-            ]
-            columns = {name: column.copy() for name, column in columns.items()}
-            for name, column in columns.items():
-                column[wrong] = {"status": -1, "fault_time": 0.0}.get(name, np.nan)
-            distinct, text_index = np.unique(
-                [f"no scene: {key}" for key in keys], return_inverse=True
-            )
-            reason[wrong] = len(texts) + text_index
+            outputs = {name: column.copy() for name, column in outputs.items()}
+            for name, column in outputs.items():
+                column[list(faults)] = _NO_SCENE.get(name, np.nan)
+            messages = []
+            for error in faults.values():
+                _, _, key = error.problems[0].key.partition(": ")
+                messages.append(f"no scene: {key}")
+            distinct, text_index = np.unique(messages, return_inverse=True)
+            reason[list(faults)] = len(texts) + text_index
             texts = np.append(texts, distinct)
-        inputs = {
-            name: column
-            for variation in study.variations
-            for name, column in zip(
-                variation.columns, values[variation.key].T, strict=True
-            )
-        }
         # Arrow copies strided columns an entry at a time.
-        named = {"scenario": rows, **inputs, **columns}
-        arrays = {name: np.ascontiguousarray(column) for name, column in named.items()}
+        arrays = {
+            name: np.ascontiguousarray(column)
+            for name, column in (columns | outputs).items()
+        }
         arrays["reason"] = pyarrow.DictionaryArray.from_arrays(
             reason.astype(np.int32), pyarrow.array(texts, pyarrow.string())
         )
@@ -441,7 +448,7 @@ class PreparedSweep:
         """Scenarios of rows, their starts and gains, and rows that make no scene."""
         numbers, starts = self._split(values)
         scenarios = Scenarios(self.study.model_scene, numbers)
-        faults = scenarios.faults(most=len(next(iter(values.values()))))
+        faults = scenarios.faults(most=_count_rows(values))
         if faults:  # they run as a row that makes one
             numbers = {key: array.copy() for key, array in numbers.items()}
             for key, array in numbers.items():
@@ -456,9 +463,9 @@ class PreparedSweep:
         rows: NDArray[np.int64],
         steps: int,
     ) -> tuple[BatchResult, dict[str, NDArray[Any]]]:
-        """Return results of rows by a number of steps.
+        """Return results of rows by a number of steps, and what is of their whole runs.
 
-        With them come their extremes or tracking figures.
+        That is extremes, reactions and tracking figures, by column.
         """
         batch = self.batch.with_parameters(scenarios)
         outputs = self.study.outputs
@@ -482,9 +489,11 @@ class PreparedSweep:
             over_time |= self._reactions(batch, scenarios, result)
         if result.kept is not None and "extremes" in outputs:
             with np.errstate(all="ignore"):
-                for (name, end), k in itertools.product(EXTREMES, range(3)):
-                    angles = getattr(result.kept, name)[..., k]
-                    over_time[f"{name}_{end}_{k + 1}"] = getattr(angles, end)(axis=0)
+                for name, end in EXTREMES:
+                    values = getattr(result.kept, name)
+                    for k in range(3):
+                        extreme = getattr(values[..., k], end)(axis=0)
+                        over_time[f"{name}_{end}_{k + 1}"] = extreme
         result.kept = None
         return result, over_time
 
@@ -497,16 +506,14 @@ class PreparedSweep:
         assert kept is not None
         model = batch.model.constants(list(batch.columns.inputs)).model
         reactions = ScenarioReactions(scenarios.columns(), model)
-        state = np.moveaxis(
-            np.concatenate([kept.quaternion, kept.body_rate], axis=-1), -1, 0
-        )
+        states = np.concatenate([kept.quaternion, kept.body_rate], axis=-1)
+        state = np.moveaxis(states, -1, 0)
         torque = np.moveaxis(kept.torque, -1, 0)
         count = result.t.shape[-1]
-        columns = {
-            f"{size}_{name}_{statistic}_{k + 1}": np.full(count, np.nan)
-            for size, name, statistic in REACTIONS
-            for k in range(3)
-        }
+        columns = {}
+        for size, name, statistic in REACTIONS:
+            for k in range(3):
+                columns[f"{size}_{name}_{statistic}_{k + 1}"] = np.full(count, np.nan)
         for first in range(0, count, REACTION_ROWS):
             rows = slice(first, first + REACTION_ROWS)
             block = kept.t[:, rows], state[..., rows], torque[..., rows]
@@ -537,21 +544,32 @@ class PreparedSweep:
 def find_range_ends(study: SweepStudy) -> dict[str, Array]:
     """Return values of what varies in its middle and at the ends of all ranges.
 
-    Of a table these are the rows with the least and the largest number of a column.
+    A table has the rows with the least and the largest number of a column, beside all
+    else in its middle, and its first row beside all other ends.
     """
-    listed = [variation for variation in study.variations if variation.kind == "table"]
-    picks = {
-        pick for x in (study.table or {}).values() for pick in (x.argmin(), x.argmax())
-    }
-    middle = {variation.key: variation.ends()[0] for variation in study.variations}
-    rows = [
-        middle | {variation.key: variation.numbers[pick] for variation in listed}
-        for pick in sorted({0} | picks)
+    of_table = [
+        variation for variation in study.variations if variation.kind == "table"
     ]
-    for variation in study.variations:
-        if variation.kind != "table":
-            rows += [rows[0] | {variation.key: end} for end in variation.ends()]
+    of_range = [
+        variation for variation in study.variations if variation.kind != "table"
+    ]
+    table_rows = {0}
+    for column in (study.table or {}).values():
+        table_rows |= {int(column.argmin()), int(column.argmax())}
+    middle = {variation.key: variation.ends()[0] for variation in study.variations}
+    rows = []
+    for number in sorted(table_rows):
+        row = {variation.key: variation.numbers[number] for variation in of_table}
+        rows.append(middle | row)
+    first = rows[0]
+    for variation in of_range:
+        rows += (first | {variation.key: end} for end in variation.ends())
     return {key: np.stack([row[key] for row in rows]) for key in middle}
+
+
+def _count_rows(values: Mapping[str, Array]) -> int:
+    """Return the number of rows that were drawn, alike for all keys."""
+    return len(next(iter(values.values())))
 
 
 def write_part(
@@ -608,20 +626,12 @@ def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
         checksum = about.get("checksum")
         intact = checksum is None or checksum == _checksum(about, table)
         name = _part_name(about["part"]) if "part" in about else path.name
+        damaged = "is damaged (its checksum is another): delete it"
+        renamed = f"was written as {name}: delete or rename it"
         refuse_unless(
             "sweep",
-            (
-                "DIR",
-                str(path),
-                intact,
-                "is damaged (its checksum is another): delete it",
-            ),
-            (
-                "DIR",
-                str(path),
-                name == path.name,
-                f"was written as {name}: delete or rename it",
-            ),
+            ("DIR", str(path), intact, damaged),
+            ("DIR", str(path), name == path.name, renamed),
         )
         return about, table
     return None
@@ -681,22 +691,29 @@ def read_sweep(folder: Path) -> pd.DataFrame:
 
     Units and study are in its `attrs`.
     """
-    read = [(path, read_part(path)) for path in sorted(folder.glob("part-*.parquet"))]
-    whole_files = [(path, *contents) for path, contents in read if contents is not None]
-    if not whole_files:
+    descriptions: dict[Path, dict[str, Any]] = {}
+    tables: list[pa.Table] = []
+    not_whole: list[Path] = []
+    for path in sorted(folder.glob("part-*.parquet")):
+        contents = read_part(path)
+        if contents is None:
+            not_whole.append(path)
+            continue
+        descriptions[path], table = contents
+        tables.append(table.replace_schema_metadata(None))
+    if not tables:
         requirement = "must be a folder with files part-*.parquet of `sst-ros sweep`"
         raise refusal("sweep", "DIR", str(folder), requirement)
-    for path, contents in read:
+    if not_whole:
         requirement = "is not whole: --resume computes it again"
-        refuse_unless("sweep", ("DIR", str(path), contents is not None, requirement))
-    first = whole_files[0][1]
-    for path, about, _ in whole_files:
-        same = all(
-            about.get(key) == first.get(key) for key in ("digest", "version", "steps")
-        )
-        requirement = f"is of another study or version than {whole_files[0][0].name}"
-        refuse_unless("sweep", ("DIR", str(path), same, requirement))
-    tables = [table.replace_schema_metadata(None) for *_, table in whole_files]
+        raise refusal("sweep", "DIR", str(not_whole[0]), requirement)
+    first_path = next(iter(descriptions))
+    first = descriptions[first_path]
+    requirement = f"is of another study or version than {first_path.name}"
+    for path, about in descriptions.items():
+        for key in ("digest", "version", "steps"):
+            same = about.get(key) == first.get(key)
+            refuse_unless("sweep", ("DIR", str(path), same, requirement))
     attributes = {
         key: value for key, value in first.items() if key not in ("part", "checksum")
     }
@@ -715,12 +732,9 @@ def to_frame(table: pa.Table, about: Mapping[str, Any]) -> pd.DataFrame:
 def summarize(table: pd.DataFrame) -> str:
     """Return a text of the table of a study."""
     outputs = table.loc[table["status"] == 0, list_outputs(table)]
-    statistics = outputs.describe(percentiles=[0.01, 0.99]).T[
-        ["mean", "std", "1%", "99%"]
-    ]
-    statistics["unit"] = [
-        table.attrs["units"].get(name, "") for name in statistics.index
-    ]
+    described = outputs.describe(percentiles=[0.01, 0.99]).T
+    units = [table.attrs["units"].get(name, "") for name in described.index]
+    statistics = described[["mean", "std", "1%", "99%"]].assign(unit=units)
     statistics_text = ""
     if len(outputs):
         statistics_text = statistics.to_string(float_format="{:.6g}".format)
@@ -729,7 +743,7 @@ def summarize(table: pd.DataFrame) -> str:
         runs=len(table),
         about=table.attrs,
         reasons=table["reason"].value_counts(),
-        causes=correlate(table).head(8).to_dict(),
+        causes=correlate(table).head(SHOWN_CAUSES).to_dict(),
         outputs=statistics_text,
     )
 
@@ -743,11 +757,11 @@ def list_outputs(table: pd.DataFrame) -> list[str]:
 def correlate(table: pd.DataFrame, column: pd.Series | None = None) -> pd.Series:
     """Spearman's rank correlation of each input with a column, largest first.
 
-    None if constant.
-
-    The column is by default whether a run ended early.
+    The column is by default whether a run ended early. Constant inputs have none, and
+    no input has one with a constant column.
     """
-    column = (table["status"] != 0).astype(float) if column is None else column
+    if column is None:
+        column = (table["status"] != 0).astype(float)
     inputs = [name for name in table.attrs["inputs"] if table[name].nunique() > 1]
     if column.nunique() < 2 or not inputs:
         return table[[]].sum()

@@ -16,7 +16,9 @@ from sst_ros.figures import BLUE, GREY, VERMILION, styled
 from sst_ros.report.results import publish
 from sst_ros.sweeps.sweep import correlate, list_outputs
 
-PANEL_COLUMNS, MOST_INPUTS, MOST_RUNS = 4, 6, 200
+PANEL_COLUMNS = 4  # of the page of distributions
+MOST_INPUTS = 6  # of a scatter matrix: those that matter most
+MOST_RUNS = 200  # that are marked as the worst
 MOST_POINTS = 2000  # of all runs in a scatter plot; the worst are drawn over them
 
 
@@ -29,7 +31,8 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
     complete = table.loc[table["status"] == 0, list_outputs(table)]
     figures = {"distributions.png": draw_distributions(complete, table.attrs["units"])}
     score, title = _score(table)
-    if names := correlate(table, score).index[:MOST_INPUTS].tolist():
+    names = correlate(table, score).index[:MOST_INPUTS].tolist()
+    if names:
         worst = np.argsort(score.to_numpy())[-MOST_RUNS:]
         figures["worst.png"] = draw_scatter(table[names], worst, title)
     publish(out, "sweep plot", figures)
@@ -37,11 +40,10 @@ def draw_pictures(table: pd.DataFrame, out: Path) -> list[Path]:
 
 
 def _score(table: pd.DataFrame) -> tuple[pd.Series, str]:
-    """How bad each run is, and what that means."""
+    """Return how bad each run is, and what that means."""
     if (table["status"] != 0).any():
-        return -table["fault_time"].fillna(
-            table["t"]
-        ), f"The {MOST_RUNS} runs that ended first"
+        end_time = table["fault_time"].fillna(table["t"])
+        return -end_time, f"The {MOST_RUNS} runs that ended first"
     numbers = table[list_outputs(table)]
     errors = numbers.filter(like="error_max")
     if len(errors.columns):
@@ -72,9 +74,10 @@ def draw_scatter(inputs: pd.DataFrame, worst: NDArray[np.intp], title: str) -> F
     figure = Figure(figsize=(1.2 + 1.8 * size, 1.2 + 1.8 * size))
     grid = figure.subplots(size, size, squeeze=False)
     sample = inputs.iloc[:: max(1, len(inputs) // MOST_POINTS)]
-    layers = (sample, GREY, 1), (inputs.iloc[worst], VERMILION, 3)
+    layers = (sample, GREY, 1), (inputs.iloc[worst], VERMILION, 3)  # with marker sizes
     for (row, column), axes in np.ndenumerate(grid):
-        vertical, horizontal = inputs.columns[row], inputs.columns[column]
+        vertical = inputs.columns[row]
+        horizontal = inputs.columns[column]
         for runs, colour, markersize in layers:
             if row == column:
                 axes.hist(runs[vertical], 30, color=colour, alpha=0.6, density=True)

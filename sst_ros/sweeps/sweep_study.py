@@ -64,11 +64,16 @@ SWEEP_OUTPUTS = (*QUANTITIES, "energy", "extremes", "reactions")
 Extremes of joints and reactions are those over a run, all else is of the final state.
 """
 
-MOST = 10_000_000
-MOST_ROWS = 1_000_000_000
-"""Of a study: some 200 GB, which takes two weeks at 1000 runs a second."""
+MOST_COUNT = 10_000_000  # of steps of a run, and of rows of a chunk
+MOST_RUNS_OF_STUDY = 1_000_000_000
+"""Some 200 GB, which take two weeks at 1000 runs a second."""
 
-_count: Any = partial(entry, default=None, least=1, most=MOST)
+_DIGEST_DIGITS = 24  # of the 64 of a SHA-256
+
+_count: Any = partial(entry, default=None, least=1, most=MOST_COUNT)
+# what all runs share: a mode of assembly, ticks, a motion and its length
+_FIXED_KEYS = ("initial.orientation", "control.period")
+_FIXED_SECTIONS = ("motion", "duration")
 _NO_TORQUE = "has no effect: the controller gives the torques"
 
 
@@ -90,7 +95,8 @@ class SweepStudy(Section):
         default_factory=dict,
     )
     n: int | None = _count(
-        "number of runs; by default that of the grid or of the table", most=MOST_ROWS
+        "number of runs; by default that of the grid or of the table",
+        most=MOST_RUNS_OF_STUDY,
     )
     seed: int = entry("of the random numbers", default=0, least=0, most=2**64 - 1)
     sampling: str = choice("of random numbers", SAMPLINGS)
@@ -138,21 +144,14 @@ class SweepStudy(Section):
             "must be a mapping from keys of the scene to distributions or values"
         )
         yield not is_mapping, "vary", self.vary, requirement
+        requirement = f"must be of {', '.join(SWEEP_OUTPUTS)}"
         for name in self.outputs:
-            yield (
-                name not in SWEEP_OUTPUTS,
-                "outputs",
-                name,
-                f"must be of {', '.join(SWEEP_OUTPUTS)}",
-            )
-        yield (
-            torque is not None and self.control is not None,
-            "torque",
-            "given",
-            _NO_TORQUE,
-        )
-        wrong = torque is not None and not isinstance(torque, (Mapping, SineTorque))
-        wrong = wrong and finite_vector(torque) is None
+            yield name not in SWEEP_OUTPUTS, "outputs", name, requirement
+        if torque is None:
+            return
+        yield self.control is not None, "torque", "given", _NO_TORQUE
+        is_profile = isinstance(torque, (Mapping, SineTorque))
+        wrong = not is_profile and finite_vector(torque) is None
         yield wrong, "torque", torque, "must be three finite numbers [N m] or a mapping"
 
     def __getstate__(self) -> dict[str, Any]:
@@ -184,9 +183,8 @@ class SweepStudy(Section):
         cls, values: Mapping[str, Any], folder: Path = Path()
     ) -> SweepStudy:
         """Build a study from a mapping; names of files are relative to a folder."""
-        settings = {"scene": None} | {
-            key: x for key, x in values.items() if x is not None
-        }
+        settings: dict[str, Any] = {"scene": None}
+        settings |= {key: value for key, value in values.items() if value is not None}
         scene = settings["scene"]
         # Of os.path, which is False where a name is too long for the file system.
         if isinstance(scene, str) and os.path.isfile(folder / scene):  # noqa: PTH113
@@ -262,11 +260,8 @@ class SweepStudy(Section):
     @cached_property
     def rows(self) -> int:
         """Number of runs."""
-        grid = math.prod(
-            len(variation.numbers)
-            for variation in self.variations
-            if variation.kind == "grid"
-        )
+        grids = [variation for variation in self.variations if variation.kind == "grid"]
+        grid = math.prod(len(variation.numbers) for variation in grids)
         lengths = {len(values) for values in (self.table or {}).values()}
         alone = len(lengths) <= 1 and not (lengths and grid > 1)
         requirement = "must have columns of equal length, and no grid beside it"
@@ -276,16 +271,12 @@ class SweepStudy(Section):
         is_given = bool(self.n or lengths or grid > 1)
         is_drawn = any(variation.drawn for variation in self.variations)
         fits = not lengths or rows <= natural
+        multiple = f"must be a multiple of {grid}, the size of the grid"
         refuse_unless(
             "sweep",
             ("n", self.n, is_given or not is_drawn, "must be given with distributions"),
             ("n", self.n, fits, f"must be <= {natural}, the rows of the table"),
-            (
-                "n",
-                self.n,
-                rows % grid == 0,
-                f"must be a multiple of {grid}, the size of the grid",
-            ),
+            ("n", self.n, rows % grid == 0, multiple),
         )
         return rows
 
@@ -313,9 +304,8 @@ class SweepStudy(Section):
     @cached_property
     def _width(self) -> int:
         """Numbers that are drawn for a row."""
-        return sum(
-            len(variation.columns) for variation in self.variations if variation.drawn
-        )
+        drawn = [variation for variation in self.variations if variation.drawn]
+        return sum(len(variation.columns) for variation in drawn)
 
     def _quantiles(self, first: int, count: int, sampling: str) -> Array:
         """Numbers in (0, 1), shape (count, width)."""
@@ -347,7 +337,8 @@ class SweepStudy(Section):
         values = self.__getstate__()
         if self.table is not None:
             values["table"] = {
-                name: make_digest(x.tobytes()) for name, x in self.table.items()
+                name: make_digest(column.tobytes())
+                for name, column in self.table.items()
             }
         return dict(plain(values))
 
@@ -357,13 +348,11 @@ class SweepStudy(Section):
         return make_digest(json.dumps(self.document(), sort_keys=True).encode())
 
     def _targets(self, key: str) -> list[Target]:
+        """Return what a key of `vary` names; ValueError where it cannot vary."""
         section, _, name = key.partition(".")
         if section == "control" and self.control is None:
             raise ValueError("acts with control only")
-        if key in ("initial.orientation", "control.period") or section in (
-            "motion",
-            "duration",
-        ):
+        if key in _FIXED_KEYS or section in _FIXED_SECTIONS:
             raise ValueError("cannot vary")
         if section == "control" and self.control is not None:
             return targets_of(self.control, name, ("control",))
@@ -373,5 +362,5 @@ class SweepStudy(Section):
 
 
 def make_digest(content: bytes) -> str:
-    """Return the first 24 digits of a SHA-256."""
-    return hashlib.sha256(content).hexdigest()[:24]
+    """Return the first digits of a SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:_DIGEST_DIGITS]

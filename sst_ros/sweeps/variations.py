@@ -35,7 +35,8 @@ EXPECTED = {"uniform": "low, high", "normal": "mean, standard deviation[, low, h
 
 SAMPLINGS = ("random", "sobol")
 
-TINY = 2.0**-53
+TINY = 2.0**-53  # the least distance of a quantile from 0 and from 1
+MIDDLE_QUANTILES = (0.4, 0.6)  # between which a normal distribution is tried
 MOST_VALUES = 10_000_000  # of a grid
 
 
@@ -71,21 +72,28 @@ class Variation:
 
     def __post_init__(self) -> None:
         """Raise ValueError if a value of the distribution or grid is not allowed."""
-        reached = self.numbers[[0, 2, 3]] if self.kind == "normal" else self.numbers
-        for target in self.targets if self.kind != "table" else ():
-            numbers, spec = self.parameters(reached)[target.key], target.spec
+        if self.kind == "table":  # whose rows are checked as scenes
+            return
+        reached = self.numbers
+        if self.kind == "normal":
+            mean, _, low, high = self.numbers
+            reached = np.array([mean, low, high])
+        by_key = self.parameters(reached)
+        for target in self.targets:
+            numbers = by_key[target.key]
             finite = numbers[np.isfinite(numbers)]
-            if not np.all(spec.allows(finite)):
+            if not np.all(target.spec.allows(finite)):
                 reach = f"it reaches from {finite.min()} to {finite.max()}"
-                raise ValueError(f"{spec.refuse()}; {reach}")
+                raise ValueError(f"{target.spec.refuse()}; {reach}")
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns of a table, one for each component."""
         shape = () if self.factor else self.targets[0].nominal.shape
-        return tuple(
-            self.key + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)
-        )
+        names = []
+        for index in np.ndindex(*shape):
+            names.append(self.key + "".join(f"[{i}]" for i in index))
+        return tuple(names)
 
     @property
     def drawn(self) -> bool:
@@ -100,21 +108,22 @@ class Variation:
         from scipy.special import ndtr, ndtri
 
         mean, deviation, low, high = self.numbers
-        first, last = ndtr((low - mean) / deviation), ndtr((high - mean) / deviation)
+        first = ndtr((low - mean) / deviation)  # quantiles of the ends
+        last = ndtr((high - mean) / deviation)
         return np.asarray(mean + deviation * ndtri(first + (last - first) * quantiles))
 
     def ends(self) -> Array:
-        """Return a middle value, and others that differ in every component.
+        """Return a middle value, then others that differ in every component.
 
-        All of a grid.
+        Of a grid they are all values.
         """
-        if not self.drawn:
-            return self.numbers
-        middle = self.numbers[0] if self.kind == "normal" else self.numbers.mean(axis=0)
-        inner = np.repeat([[0.4], [0.6]], len(self.columns), axis=1)
-        return np.vstack(
-            [middle, self.values(inner) if self.kind == "normal" else self.numbers]
-        )
+        if self.kind == "uniform":
+            return np.vstack([self.numbers.mean(axis=0), self.numbers])
+        if self.kind == "normal":
+            quantiles = np.tile(MIDDLE_QUANTILES, (len(self.columns), 1)).T
+            mean, *_ = self.numbers
+            return np.vstack([mean, self.values(quantiles)])
+        return self.numbers
 
     def parameters(self, values: Array) -> dict[str, Array]:
         """Arrays (n, ...) by key of the scene for values (n, components)."""
@@ -136,15 +145,11 @@ def targets_of(tree: Section, key: str, place: Place = ()) -> list[Target]:
         if spec.kind == "number" and value is None:
             raise ValueError(f"the scene has no {full_key}")
         if isinstance(value, Inertia):
-            entries = (
-                (entry, getattr(value, entry), of)
-                for entry, of in Inertia.SPECS.items()
-            )
-            targets += [
-                Target(f"{full_key}.{entry}", np.array(x), of)
-                for entry, x, of in entries
-                if x
-            ]
+            for name, entry_spec in Inertia.SPECS.items():
+                entry = getattr(value, name)
+                if entry:  # a zero has no factor
+                    entry_key = f"{full_key}.{name}"
+                    targets.append(Target(entry_key, np.array(entry), entry_spec))
         elif spec.kind == "number":
             targets.append(Target(full_key, np.array(value, dtype=float), spec))
         else:
@@ -162,27 +167,7 @@ def read_variation(key: str, distribution: Any, targets: Sequence[Target]) -> Va
 
     Raises ValueError where it is none.
     """
-    form, numbers, relative = "grid", distribution, False
-    if isinstance(distribution, Mapping):
-        options = dict(distribution)
-        relative = options.pop("relative", False)
-        form, numbers = next(iter(options.items())) if len(options) == 1 else ("", ())
-    elif (
-        isinstance(distribution, tuple)
-        and distribution
-        and isinstance(distribution[0], str)
-    ):
-        form, relative = (
-            distribution[0],
-            isinstance(distribution[-1], str) and distribution[-1] == "relative",
-        )
-        numbers = distribution[1 : len(distribution) - relative]
-    listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
-    if form not in VARIATION_KINDS or not isinstance(relative, bool) or not listed:
-        raise ValueError(
-            f"must be a list of values, or one of {', '.join(VARIATION_KINDS)} with"
-            " its numbers"
-        )
+    form, numbers, relative = _read_form(distribution)
     factor = _scales_tensor(key, targets)
     if factor and not relative:
         raise ValueError(
@@ -190,30 +175,12 @@ def read_variation(key: str, distribution: Any, targets: Sequence[Target]) -> Va
         )
     nominal = np.ones(()) if factor else targets[0].nominal
     if form == "linspace":
-        count = numbers[2] if len(numbers) == 3 else 0
-        if not (isinstance(count, Integral) and 0 < int(count) <= MOST_VALUES):
-            raise ValueError(
-                f"linspace takes low, high, count (whole, 1 to {MOST_VALUES})"
-            )
-        low, high = (
-            np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers[:2]
-        )
-        form, numbers = "grid", np.linspace(low, high, int(count))
-    if form == "normal" and len(numbers) == 2:
-        numbers = (*numbers, -np.inf, np.inf)
-    expected = EXPECTED.get(form, "")
-    if expected and len(numbers) != expected.count(",") + 1:
-        raise ValueError(f"{form} takes {expected}")
-    if form != "grid":
-        numbers = [np.broadcast_to(real_numbers(x), nominal.shape) for x in numbers]
-    values = np.array(real_numbers(numbers))
-    if form == "grid" and (values.shape[1:] != nominal.shape or not len(values)):
-        raise ValueError(f"must be a list of values of shape {nominal.shape}")
-    bounded = values if form == "grid" else values[:2]
-    if np.isnan(values).any() or not np.isfinite(bounded).all():
-        raise ValueError("must be finite numbers")
-    if form != "grid" and not np.all(values[-2] < values[-1]):
-        raise ValueError("the lower end must be less than the upper one")
+        form = "grid"
+        numbers = _expand_linspace(numbers, nominal.shape)
+    if form == "grid":
+        values = _read_grid(numbers, nominal.shape)
+    else:
+        values = _read_numbers(form, numbers, nominal.shape)
     if relative and not factor:
         if any(not np.array_equal(target.nominal, nominal) for target in targets):
             raise ValueError("its entries differ in the scene: give each by its index")
@@ -227,16 +194,79 @@ def read_variation(key: str, distribution: Any, targets: Sequence[Target]) -> Va
     return Variation(key, form, values.reshape(len(values), -1), targets, factor)
 
 
+def _read_form(distribution: Any) -> tuple[str, Any, bool]:
+    """Return kind and numbers of an entry of `vary`, and whether it is relative."""
+    form = "grid"
+    numbers = distribution
+    relative = False
+    if isinstance(distribution, Mapping):
+        options = dict(distribution)
+        relative = options.pop("relative", False)
+        form = ""
+        if len(options) == 1:
+            ((form, numbers),) = options.items()
+    elif isinstance(distribution, tuple) and distribution:
+        first, *others = distribution
+        if isinstance(first, str):
+            form = first
+            last = others[-1] if others else None
+            relative = isinstance(last, str) and last == "relative"
+            numbers = tuple(others[:-1] if relative else others)
+    listed = np.iterable(numbers) and not isinstance(numbers, (str, bytes, bytearray))
+    if form not in VARIATION_KINDS or not isinstance(relative, bool) or not listed:
+        raise ValueError(
+            f"must be a list of values, or one of {', '.join(VARIATION_KINDS)} with"
+            " its numbers"
+        )
+    return form, numbers, relative
+
+
+def _expand_linspace(numbers: Any, shape: tuple[int, ...]) -> Array:
+    """Return the values of low, high, count."""
+    low, high, count = numbers if len(numbers) == 3 else (0.0, 0.0, 0)
+    if not (isinstance(count, Integral) and 0 < int(count) <= MOST_VALUES):
+        raise ValueError(f"linspace takes low, high, count (whole, 1 to {MOST_VALUES})")
+    first = np.broadcast_to(real_numbers(low), shape)
+    last = np.broadcast_to(real_numbers(high), shape)
+    return np.linspace(first, last, int(count))
+
+
+def _read_grid(numbers: Any, shape: tuple[int, ...]) -> Array:
+    """Return values of a shape, one or more."""
+    values = np.array(real_numbers(numbers))
+    if values.shape[1:] != shape or not len(values):
+        raise ValueError(f"must be a list of values of shape {shape}")
+    if not np.isfinite(values).all():
+        raise ValueError("must be finite numbers")
+    return values
+
+
+def _read_numbers(form: str, numbers: Any, shape: tuple[int, ...]) -> Array:
+    """Return the numbers of a distribution, each of a shape, as in `Variation`."""
+    if form == "normal" and len(numbers) == 2:
+        numbers = (*numbers, -np.inf, np.inf)
+    expected = EXPECTED[form]
+    if len(numbers) != expected.count(",") + 1:
+        raise ValueError(f"{form} takes {expected}")
+    components = [np.broadcast_to(real_numbers(number), shape) for number in numbers]
+    values = np.array(real_numbers(components))
+    # Ends of a normal distribution may be infinite.
+    if np.isnan(values).any() or not np.isfinite(values[:2]).all():
+        raise ValueError("must be finite numbers")
+    *_, low, high = values
+    if not np.all(low < high):
+        raise ValueError("the lower end must be less than the upper one")
+    return values
+
+
 def tabulate(
     key: str, columns: Mapping[str, Array], targets: Sequence[Target]
 ) -> Variation:
     """Return the variation of a key by columns of a table, which must be complete."""
     if len(set(map(len, columns.values()))) > 1:
         raise ValueError("must have columns of equal length")
-    values, factor = (
-        np.stack(list(columns.values()), axis=1),
-        _scales_tensor(key, targets),
-    )
+    values = np.stack(list(columns.values()), axis=1)
+    factor = _scales_tensor(key, targets)
     variation = Variation(key, "table", values, targets, factor)
     if tuple(columns) != variation.columns:
         raise ValueError(f"needs the columns {', '.join(variation.columns)}")
@@ -245,11 +275,8 @@ def tabulate(
 
 def read_table(source: Any) -> dict[str, Array]:
     """Read columns of numbers from a DataFrame, a mapping, or a CSV or Parquet file."""
-    refused = (
-        "table",
-        str(source),
-        "must be columns of numbers, or a .csv or .parquet file of them",
-    )
+    requirement = "must be columns of numbers, or a .csv or .parquet file of them"
+    refused = "table", str(source), requirement
     with refuse_errors("sweep", *refused, OSError, ValueError, TypeError, LookupError):
         if isinstance(source, Path):
             check_regular(source)
@@ -265,7 +292,8 @@ def read_table(source: Any) -> dict[str, Array]:
 
 def philox(seed: int, first: int, count: int, width: int) -> Array:
     """Uniform numbers in (0, 1) of rows `first` on, shape (count, width)."""
-    blocks = -(-width // 4)  # a value of the counter gives four numbers
+    # A value of the counter gives four numbers; the last of them may have no column.
+    blocks = -(-width // 4)
     generator = np.random.Philox(key=seed)
     generator.advance(first * blocks)
     raw = generator.random_raw(count * 4 * blocks).reshape(count, 4 * blocks)[:, :width]

@@ -23,30 +23,63 @@ from scipy.spatial.transform import Rotation
 
 from sst_ros.description import robot
 from sst_ros.files import load_templates
-from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of
+from sst_ros.mechanism.geometry import (
+    Array,
+    Geometry,
+    quaternion_of,
+    star_direction,
+)
 from sst_ros.scene.scene import Scene
 from sst_ros.state import ZERO
 from sst_ros.view.server import PageServer
 from sst_ros.view.source import Replay, RunControl, ViewState
 
 PERIOD_S = 1.0 / 30.0
-# frames between two updates of the numbers, and of the plots
+"""Period of the frames."""
 _SHOW_EVERY = 3
+"""Frames between two updates of the numbers: faster ones could not be read."""
 _DRAW_EVERY = 6
+"""Frames between two updates of the plots."""
 _PANEL_WIDTH = 400.0
-_LARGEST_TORQUE = 5.0  # range of the torque sliders where the scene has no limit [N m]
+_LARGEST_TORQUE = 5.0
+"""Range of the torque sliders where the scene has no limit [N m]."""
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
+"""Time for which a refusal is contents."""
 _WINDOW_S = 10.0
+"""Time that the plots show."""
 _CURVE_POINTS = 500
+"""Points of a curve: about as many as it has pixels."""
 _COLOURS = tuple(
-    "#" + "".join(f"{round(255 * x):02x}" for x in rgb) for rgb in robot.LEG_COLOURS
+    "#" + "".join(f"{round(255 * share):02x}" for share in colour)
+    for colour in robot.LEG_COLOURS
 )
+"""Colours of the legs in HTML."""
 _BRAND = (0, 114, 178)
 _LEVELS = ("#2b8a3e", "#e67700", "#c92a2a")
+"""Colours of a status that is OK, a warning or an error."""
 
-# controls as in a phase, at a time [s]
+ROOT = "/manipulator"
+"""Node of viser's scene that has all that is drawn of the manipulator."""
+PATH_POINTS = 400
+"""Points by which the path of E is drawn."""
+_POINT_PERIOD_S = 0.008
+"""Least time between two of them."""
+_PATH_S = 4.0
+"""Time for which a point stays."""
+_LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
+"""The path lies a little outside the star, which would hide it.
+
+Newer parts lie above older ones.
+"""
+_OLD_COLOUR = np.array([0.90, 0.86, 0.92])
+_NEW_COLOUR = np.array([0.42, 0.00, 0.42])
+"""Colours of the ends of the path; between them they blend."""
+_SIDES = 20
+"""Corners of an arc's cross-section."""
+
 Show: TypeAlias = Callable[[str, float | None], None]
+"""Shows the controls as they are in a phase, at a time [s]."""
 _PANEL: Any = load_templates("view").get_template("panel.html").module
 
 
@@ -56,6 +89,19 @@ class _PlotSample(NamedTuple):
     time: float  # [s]
     degrees: Array  # actuator angles [deg], shape (3,)
     torque: Sequence[float]  # [N m], shape (3,)
+
+
+class _PageContents(NamedTuple):
+    """A scene on the page, and what of the page changes while it is contents."""
+
+    scene: Scene
+    drawing: SceneDrawing
+    show_controls: Show
+    head: viser.GuiHtmlHandle  # name, phase and time
+    joints: viser.GuiHtmlHandle  # numbers of the state
+    status: viser.GuiHtmlHandle  # of the run
+    angle_plot: viser.GuiUplotHandle
+    torque_plot: viser.GuiUplotHandle
 
 
 class Page:
@@ -72,8 +118,9 @@ class Page:
         # No markdown: viser sends its text as an update, which a slow browser complains
         # of where it gets the removal at once with it.
         self._server.gui.add_html("<small>&nbsp; Waiting for a simulator ...</small>")
-        self._scene: Scene | None = None
-        self._state: ViewState | None = None
+        self._contents: _PageContents | None = None
+        self._state: ViewState | None = None  # the last one
+        self._samples: deque[_PlotSample] = deque(maxlen=_CURVE_POINTS)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._live, name="page", daemon=True)
         self._thread.start()
@@ -91,21 +138,26 @@ class Page:
         self._server.stop()
 
     def _live(self) -> None:
+        """Show the source, frame by frame, until the page is closed."""
         due = time.monotonic()
-        for count in itertools.count():
+        for frame in itertools.count():
             scene = self._source.scene
-            if scene is not None and scene != self._scene:
-                self._build(scene)
-            if self._scene is not None:
+            if scene is not None and not self._shows(scene):
+                self._contents = self._build(scene)
+            if self._contents is not None:
                 with self._server.atomic():
-                    self._update(count)
+                    self._update(self._contents, frame)
             due = max(due + PERIOD_S, time.monotonic())  # late frames are dropped
             if self._stop.wait(max(0.0, due - time.monotonic())):
                 return
 
+    def _shows(self, scene: Scene) -> bool:
+        return self._contents is not None and self._contents.scene == scene
+
     def _clear(self) -> None:
         """Empty the page; set the theme, the panel's place and the light."""
-        gui, scene = self._server.gui, self._server.scene
+        gui = self._server.gui
+        scene = self._server.scene
         gui.reset()
         gui.configure_theme(
             brand_color=_BRAND,
@@ -120,28 +172,37 @@ class Page:
         scene.configure_environment_map(None)
         scene.set_up_direction("+z")
 
-    def _build(self, scene: Scene) -> None:
-        """Replace the scene that is shown: picture, numbers, plots and controls."""
+    def _build(self, scene: Scene) -> _PageContents:
+        """Replace what is shown by a scene: picture, numbers, plots and controls."""
         self._clear()
+        self._state = None
+        self._samples.clear()
         server = self._server
         gui = server.gui
-        self._scene = scene
-        self._state = None
         if isinstance(self._source, Replay):
-            self._show_controls = _add_replay_controls(server, self._source)
+            show_controls = _add_replay_controls(server, self._source)
         else:
-            self._show_controls = _add_run_controls(server, scene, self._source)
-        self._drawing = SceneDrawing(server, scene)
-        self._head = gui.add_html("", order=0.0)
-        self._joints = gui.add_html("", order=2.0)
+            show_controls = _add_run_controls(server, scene, self._source)
+        drawing = SceneDrawing(server, scene)
+        head = gui.add_html("", order=0.0)
+        joints = gui.add_html("", order=2.0)
         with gui.add_folder("actuator angles γ, last 10 s", order=3.0):
-            self._angle_plot = _plot(server, "γ [deg]", (0.0, 90.0))
+            angle_plot = _plot(server, "γ [deg]", (0.0, 90.0))
         with gui.add_folder("torques τ, last 10 s", order=4.0):
-            self._torque_plot = _plot(server, "τ [N m]", (-1.0, 1.0))
+            torque_plot = _plot(server, "τ [N m]", (-1.0, 1.0))
         with gui.add_folder("status of the run", order=6.0):
-            self._status = gui.add_html("")
-        self._samples: deque[_PlotSample] = deque(maxlen=_CURVE_POINTS)
+            status = gui.add_html("")
         self._place_cameras(scene)
+        return _PageContents(
+            scene=scene,
+            drawing=drawing,
+            show_controls=show_controls,
+            head=head,
+            joints=joints,
+            status=status,
+            angle_plot=angle_plot,
+            torque_plot=torque_plot,
+        )
 
     def _place_cameras(self, scene: Scene) -> None:
         """Look at the manipulator from outside, over the middle of the base."""
@@ -155,28 +216,28 @@ class Page:
             camera.look_at = 0.28 * size * middle
             camera.fov = np.radians(35.0)
 
-    def _update(self, count: int) -> None:
+    def _update(self, contents: _PageContents, frame: int) -> None:
         """Take what is new, and show it where it is due."""
         for state in self._source.states():
-            self._drawing.add(state.time, state.angles)
+            contents.drawing.add(state.time, state.angles)
             self._add_to_plots(state)
             self._state = state
         if self._state is not None:
-            self._drawing.show(self._state.angles, self._state.torque)
-        if count % _SHOW_EVERY == 0:
-            self._show_numbers()
-        if count % _DRAW_EVERY == 0 and len(self._samples) >= 2:
-            self._draw_plots()
+            contents.drawing.show(self._state.angles, self._state.torque)
+        if frame % _SHOW_EVERY == 0:
+            self._show_numbers(contents)
+        if frame % _DRAW_EVERY == 0 and len(self._samples) >= 2:
+            self._draw_plots(contents)
 
-    def _draw_plots(self) -> None:
+    def _draw_plots(self, contents: _PageContents) -> None:
         """Show the samples of the last ten seconds."""
         begin = self._samples[-1].time - _WINDOW_S
         samples = [sample for sample in self._samples if sample.time > begin]
         times = np.array([sample.time for sample in samples])
         degrees = np.array([sample.degrees for sample in samples])
         torques = np.array([sample.torque for sample in samples])
-        self._angle_plot.data = (times, *degrees.T.copy())
-        self._torque_plot.data = (times, *torques.T.copy())
+        contents.angle_plot.data = (times, *degrees.T.copy())
+        contents.torque_plot.data = (times, *torques.T.copy())
 
     def _add_to_plots(self, state: ViewState) -> None:
         """Add a state to the plots; a time that goes back begins new ones."""
@@ -189,7 +250,7 @@ class Page:
             degrees = np.degrees(state.gamma)
             self._samples.append(_PlotSample(state.time, degrees, state.torque))
 
-    def _show_numbers(self) -> None:
+    def _show_numbers(self, contents: _PageContents) -> None:
         """Show name, phase, time, numbers of the state, and what is possible now."""
         state = self._state
         status = self._source.status()
@@ -197,13 +258,13 @@ class Page:
         time = None if state is None else state.time
         time_text = "–" if time is None else f"{time:.2f} s"
         level = 2 if phase.startswith("fault") else status.level
-        head = _PANEL.head(self._scene, phase, _LEVELS[level], time_text)
-        self._head.content = str(head)
+        head = _PANEL.head(contents.scene, phase, _LEVELS[level], time_text)
+        contents.head.content = str(head)
         if state is not None:
-            self._joints.content = str(_PANEL.joints(_COLOURS, state))
+            contents.joints.content = str(_PANEL.joints(_COLOURS, state))
             panel = _PANEL.status(_LEVELS[status.level], status.message, status.values)
-            self._status.content = str(panel)
-        self._show_controls(phase, time)
+            contents.status.content = str(panel)
+        contents.show_controls(phase, time)
 
 
 def _plot(
@@ -250,7 +311,7 @@ def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show
         zero = gui.add_button("Zero", icon=viser.Icon.CIRCLE_OFF)
 
     def ask(event: Any) -> None:
-        """Ask for what a button says, and notify the client of a refusal."""
+        """Ask for what a button says, and notify its client of a refusal."""
         if event.target is reset and any(slider.value for slider in sliders):
             release(event)
         name = event.target.label.lower()
@@ -260,16 +321,19 @@ def _add_run_controls(server: PageServer, scene: Scene, run: RunControl) -> Show
             event.client.add_notification(f"{name} refused", message, **look)
 
     def apply(event: Any) -> None:
+        """Hold the torques of the sliders, where a person has moved one."""
         if event.client is not None:
             first, second, third = (float(slider.value) for slider in sliders)
             run.apply((first, second, third))
 
     def release(_: Any) -> None:
+        """Move all sliders to zero, and hold no torque."""
         for slider in sliders:
             _move(slider, 0.0)
         run.apply(ZERO)
 
     def show(phase: str, _: float | None) -> None:
+        """Name the button, and enable what is possible."""
         if (phase == "paused") != (pause.label == "Resume"):
             _name(pause, "Resume" if phase == "paused" else "Pause")
             step.disabled = phase != "paused"
@@ -330,20 +394,6 @@ def _move(slider: viser.GuiSliderHandle[float], value: float) -> None:
     slider.value = value  # type: ignore[misc]  # its setter does not follow its getter at once
 
 
-PATH_POINTS = 400
-_POINT_PERIOD_S = 0.008
-_PATH_S = 4.0
-_LIFT = np.linspace(1.006, 1.022, PATH_POINTS)[:, None]
-"""The path lies a little outside the star, which would hide it.
-
-Newer parts above older ones.
-"""
-_OLD_COLOUR = np.array([0.90, 0.86, 0.92])
-_NEW_COLOUR = np.array([0.42, 0.00, 0.42])
-ROOT = "/manipulator"
-_SIDES = 20  # corners of an arc's cross-section
-
-
 class SceneDrawing:
     """One scene as drawn, in nodes below ROOT."""
 
@@ -352,6 +402,10 @@ class SceneDrawing:
         self._scene = scene
         self._geometry = Geometry.of(scene)
         self._joints = robot.joints_of(self._geometry)
+        # those of leg 1, which lead to the star
+        self._joints_to_star = [
+            joint for joint in self._joints if joint.name.endswith("_1")
+        ]
         self._frames = {}
         for link, drawn in robot.shapes(scene).items():
             self._frames[link] = server.scene.add_frame(
@@ -395,8 +449,8 @@ class SceneDrawing:
             self._last = -np.inf
         if time is not None and time - self._last >= _POINT_PERIOD_S:
             self._last = time
-            star = robot.rotations(self._joints[:3], angles)[robot.STAR_LINK]
-            self._points.append((time, self._scene.star.radius * star[:, 2]))
+            rotations = robot.rotations(self._joints_to_star, angles)
+            self._points.append((time, self._position_of_e(rotations)))
             while self._points[0][0] < time - _PATH_S:
                 self._points.popleft()
 
@@ -405,12 +459,15 @@ class SceneDrawing:
         rotations = robot.rotations(self._joints, angles)
         for link, frame in self._frames.items():
             frame.wxyz = wxyz(rotations[link])
-        end = self._scene.star.radius * rotations[robot.STAR_LINK][:, 2]
-        self._show_path(end)
+        self._show_path(self._position_of_e(rotations))
         # The largest torque yet has an arrow of full length.
         self._largest_torque = max(self._largest_torque, *map(abs, torque))
         for arrow, tau, w in zip(self._torques, torque, self._geometry.w, strict=True):
             self._show_torque(arrow, tau, w)
+
+    def _position_of_e(self, rotations: Mapping[str, Array]) -> Array:
+        """Return the position of E in {B} [m], shape (3,), by the links' rotations."""
+        return self._scene.star.radius * star_direction(rotations[robot.STAR_LINK])
 
     def _show_path(self, end: Array) -> None:
         """Show the points of the path and E, shape (3,); the first fills the rest."""

@@ -36,9 +36,13 @@ from sst_ros.errors import SstError, refusal, refuse_errors, refuse_unless
 
 LOCAL = "127.0.0.1"
 PORT = 8080
-TITLE, COOKIE = "sst_ros", "sst_view_{}"
-_PORTS = (1024, 65535)
-_TRIED = 100  # ports, from the given one on
+TITLE = "sst_ros"
+COOKIE = "sst_view_{}"
+"""Name of the cookie of the page at a port: pages of one address share cookies."""
+_FIRST_PORT = 1024
+_LAST_PORT = 65535
+_TRIED = 100
+"""Ports that are tried, from the given one on."""
 
 Handler = Callable[[ServerConnection, Request], Response | None]
 _starting = threading.Lock()
@@ -59,7 +63,8 @@ class AccessCheck:
         self.installed = True
 
         def handler(connection: ServerConnection, request: Request) -> Response | None:
-            if reason := self.refusal(connection.local_address, request):
+            reason = self.refusal(connection.local_address, request)
+            if reason:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
             if urlsplit(request.path).path == "/":
                 # the title is in the page's text
@@ -180,14 +185,15 @@ def _free_port(host: str, port: int) -> int:
 
     Viser would look without end, or stop with a traceback.
     """
-    requirement = f"must be between {_PORTS[0]} and {_PORTS[1]}"
-    refuse_unless("view", ("port", port, _PORTS[0] <= port <= _PORTS[1], requirement))
-    host_check = "host", host, "must be an address of this machine"
-    with refuse_errors("view", *host_check, OSError, ValueError):
+    is_port = _FIRST_PORT <= port <= _LAST_PORT
+    requirement = f"must be between {_FIRST_PORT} and {_LAST_PORT}"
+    refuse_unless("view", ("port", port, is_port, requirement))
+    requirement = "must be an address of this machine"
+    with refuse_errors("view", "host", host, requirement, OSError, ValueError):
         # An empty name would be every address: getaddrinfo knows none of it.
         addresses = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
         _listen(addresses, 0)
-    last = min(port + _TRIED - 1, _PORTS[1])
+    last = min(port + _TRIED - 1, _LAST_PORT)
     for tried in range(port, last + 1):
         with contextlib.suppress(OSError):
             _listen(addresses, tried)
@@ -212,6 +218,7 @@ def _name(host: str) -> str:
 
 
 def _loopback(address: str) -> bool:
+    """Return whether only this machine reaches an address."""
     try:
         return ipaddress.ip_address(address).is_loopback
     except ValueError:

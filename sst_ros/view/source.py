@@ -19,8 +19,8 @@ from sst_ros.scene.loads import JOINTS
 from sst_ros.scene.scene import Scene
 from sst_ros.state import Vector3
 
-# of a simulator that is only looked at [Hz]: more than a screen shows
 _PUBLISH_RATE = 100
+"""Rate of a simulator that is only looked at [Hz]: more than a screen shows."""
 
 
 class ViewState(NamedTuple):
@@ -66,7 +66,7 @@ class RunControl(Protocol):
     def ask(self, request: str) -> tuple[bool, str]:
         """Ask to pause, resume, step (a paused run by one sample) or reset.
 
-        Success and message.
+        Return whether that was done, and the reply.
         """
 
     def apply(self, torque: Vector3) -> None:
@@ -119,7 +119,9 @@ class Replay:
         """Return the states up to now, from the beginning after a jump back."""
         with self._advance():
             time = self._time
-        row = max(int(np.searchsorted(self._seconds, time + 1e-9, side="right")) - 1, 0)
+        # a sample at this time counts, whatever the rounding of both
+        later_row = int(np.searchsorted(self._seconds, time + 1e-9, side="right"))
+        row = max(later_row - 1, 0)
         first = self._sent + 1 if row >= self._sent else 0
         self._sent = row
         run = self._run
@@ -141,13 +143,12 @@ class Replay:
     def _advance(self) -> Iterator[None]:
         """Hold the lock, with the time of the recording at what it is now."""
         with self._lock:
-            clock = time.monotonic()
+            now = time.monotonic()
             if self.playing:
-                self._time = min(
-                    self._time + (clock - self._since) * self._factor, self.length
-                )
+                played = (now - self._since) * self._factor
+                self._time = min(self._time + played, self.length)
                 self.playing = self._time < self.length
-            self._since = clock
+            self._since = now
             yield
 
 

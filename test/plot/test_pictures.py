@@ -327,7 +327,7 @@ def test_the_panel_names_equal_runs_and_those_that_share_nothing(
         [pair[0], pair[0], pair[1], late],
         ["first", "same", "changed", "late"],
     )
-    drawn = list(zip(runs, names, figures.LINES, strict=False))
+    drawn = list(map(compare.DrawnRun, runs, names, figures.LINES))
     panel = compare.COMPARISON_PICTURES["gamma"].make(drawn).axes[-1]
     said = [line.get_label() for line in panel.lines]
     assert said == ["same: no difference", "changed", "late: no samples in common"]

@@ -4,6 +4,7 @@
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -186,6 +187,27 @@ signal.raise_signal(signal.SIGINT)
 sys.setprofile(None)
 print(bool(signals.came))
 """
+
+
+def test_a_signal_to_the_tests_ends_no_later_node(run_here):
+    usual = signal.getsignal(signal.SIGINT)
+
+    def interrupt_the_node():
+        handler = usual
+        deadline = time.monotonic() + 60.0
+        while handler is usual or not callable(handler):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+            handler = signal.getsignal(signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    sender = threading.Thread(target=interrupt_the_node)
+    sender.start()
+    with pytest.raises(KeyboardInterrupt):
+        run_here("torque_player", timeout=60.0)
+    sender.join()
+    status, _, err = run_here("simulator", rate=300)
+    assert status == 1 and "must divide 1e9" in err
 
 
 def test_a_signal_within_the_handler_of_another_does_not_block():

@@ -13,7 +13,8 @@ from sst_ros import load_scene
 from sst_ros.runtime.run_loop import RunLoop
 from sst_ros.runtime.settings import SimulatorParameters
 from sst_ros.runtime.tick_loop import Pacer, RunParts, SteadyTime
-from sst_ros.runtime.torque_input import ACTUATED_JOINTS, MOST_WAITING, TorqueInput
+from sst_ros.runtime.torque_input import MOST_WAITING, TorqueInput
+from sst_ros.scene.loads import ACTUATED_JOINTS
 from sst_ros.simulation.simulation import Simulation
 
 

@@ -45,7 +45,9 @@ def test_a_process_keeps_its_domain_until_it_ends(monkeypatch):
     with subprocess.Popen([sys.executable, "-c", KEEP], **pipes) as process:
         number, network = process.stdout.readline().split()
         assert network == "LOCALHOST"
-        monkeypatch.setattr(child_process, "_next", itertools.repeat(int(number) - 1))
+        monkeypatch.setattr(
+            child_process, "_next_domain", itertools.repeat(int(number) - 1)
+        )
         with pytest.raises(SstError, match="in use: set ROS_DOMAIN_ID"), own_domain():
             pass
         process.communicate()
@@ -63,11 +65,11 @@ def test_a_domain_in_which_a_node_is_left_is_not_taken(monkeypatch, participant)
     """
     with own_domain() as number:
         pass
-    monkeypatch.setattr(child_process, "_next", itertools.count(number - 1))
+    monkeypatch.setattr(child_process, "_next_domain", itertools.count(number - 1))
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as node:
         node.bind(("", 7400 + 250 * number + 10 + 2 * participant))  # RTPS 2.5, 9.6.2.3
         with own_domain() as other:
             assert other != number
-    monkeypatch.setattr(child_process, "_next", itertools.count(number - 1))
+    monkeypatch.setattr(child_process, "_next_domain", itertools.count(number - 1))
     with own_domain() as same:
         assert same == number

@@ -13,7 +13,7 @@ from slow_cases import slow_after
 
 from sst_ros.errors import RunStopped
 from sst_ros.integration import method_steps
-from sst_ros.runtime import tick_loop
+from sst_ros.runtime import run_loop, tick_loop
 from sst_ros.runtime.diagnostics import OK, WARN, RunDiagnostics
 from sst_ros.runtime.run_loop import Phase, Reply
 from sst_ros.simulation.simulation import Simulation
@@ -409,6 +409,40 @@ def test_the_state_is_shown_while_the_code_is_loaded(start):
     loaded.set()
     bench.to(Phase.FINISHED)
     assert output.stamps[0] > output.idles[-1][2]
+
+
+def test_a_request_waits_until_the_code_is_loaded(start, monkeypatch):
+    """However long that takes on a busy machine."""
+    monkeypatch.setattr(run_loop, "_LONGEST_REPLY_S", 0.05)
+    loaded = threading.Event()
+
+    class Slow(Simulation):
+        def load_code(self):
+            assert loaded.wait(40.0)
+
+    bench = start(build=Slow)
+    idles = bench.output.idles
+    bench.until(lambda: idles)
+    with ThreadPoolExecutor() as pool:
+        reply = pool.submit(bench.ask, "pause", True)
+        shown = len(idles)
+        bench.until(lambda: len(idles) > shown + 3 or reply.done())
+        replied_before = reply.done()
+        monkeypatch.setattr(run_loop, "_LONGEST_REPLY_S", 40.0)
+        loaded.set()
+        assert reply.result(40.0) == (True, "paused")
+    assert not replied_before
+
+
+def test_a_request_that_is_not_served_in_time_says_so(start, monkeypatch):
+    monkeypatch.setattr(run_loop, "_LONGEST_REPLY_S", 0.05)
+    bench = start()
+    bench.to(Phase.RUNNING)
+    goes_on = threading.Event()
+    bench.loop.post(lambda: Reply(goes_on.wait(40.0), ""))
+    reply = bench.ask("pause", True)
+    goes_on.set()
+    assert reply == (False, "not done: the run did not reply within 0.05 s")
 
 
 def test_a_run_is_stopped_while_its_code_is_loaded(start):
