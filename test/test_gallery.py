@@ -93,6 +93,7 @@ def test_energy_is_conserved_while_it_moves(name, bound):
     assert name != "fast_spin" or np.abs(of(name, "gamma_dot")).max() > 100.0
 
 
+@pytest.mark.slow
 def test_with_friction_the_kinetic_energy_is_less_than_without():
     simulation, states, _ = run("friction")
     free, torque = (

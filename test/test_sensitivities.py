@@ -127,6 +127,7 @@ def test_sensitivities_are_the_limit_of_differences(kind, at_stops):
         )
 
 
+@pytest.mark.slow
 def test_a_key_of_several_numbers_means_each_of_them():
     several = ("initial.gamma_dot", "actuated_links.inertia.zz")
     each = [f"initial.gamma_dot[{k}]" for k in range(3)]

@@ -100,6 +100,7 @@ def test_the_holding_torque_is_the_slope_of_the_potential_energy(sample):
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 @FEW
 @given(samples(), st.floats(0.0, 1.0))
 def test_the_equation_of_motion_is_the_papers_with_every_load(sample, number):

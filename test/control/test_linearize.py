@@ -174,6 +174,7 @@ def test_a_period_takes_a_call_of_a_program_a_step(monkeypatch, name, most_calls
     assert checks == 7
 
 
+@pytest.mark.slow
 def test_a_period_has_the_same_bits_without_llvmlite():
     pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     compiled = linearize("friction", None, (0.01, 0.0, 0.0), dt=2e-3)

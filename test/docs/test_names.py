@@ -7,6 +7,7 @@ import re
 import sys
 from functools import cache
 
+import pytest
 from docs.blocks import ROOT
 
 TREES = (
@@ -92,6 +93,7 @@ def missing(said, *, names):
             yield name
 
 
+@pytest.mark.slow
 def test_what_a_text_names_is_there():
     """In the package's docstrings and comments, words in backquotes are names, too."""
     stale = {}

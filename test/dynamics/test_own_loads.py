@@ -204,6 +204,7 @@ def test_parameters_of_own_loads_vary_in_batches_and_sweeps():
     assert table["gamma_1"].to_numpy() == pytest.approx(result.gamma[:, 0], abs=1e-8)
 
 
+@pytest.mark.slow
 def test_linear_models_have_own_loads():
     scene = windy()
     state = Simulation(scene).state

@@ -129,6 +129,7 @@ def test_uneven_stamps_are_sampled_again_with_a_word():
     assert found.delay == pytest.approx(DELAY, abs=4.0 * found.delay_deviation)
 
 
+@pytest.mark.slow
 def test_a_motion_with_gaps_is_cut_into_segments_with_a_word():
     data = measure(5)
     t = data["t"]

@@ -245,6 +245,7 @@ def test_angles_of_example_1_fix_inertia_times_initial_rate():
     assert "known to " in found.table()
 
 
+@pytest.mark.slow
 def test_inertias_that_no_bodies_have_do_not_enter_the_scene():
     """The thin arc of the links is flat: a smaller zz alone breaks the triangle
     inequality.

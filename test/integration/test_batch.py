@@ -232,6 +232,7 @@ def test_an_interrupt_ends_a_batch_at_once(threads):
     assert b"KeyboardInterrupt" in said
 
 
+@pytest.mark.slow
 def test_a_batch_needs_no_numba():
     program = """
 import sys

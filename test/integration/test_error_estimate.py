@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import pytest
 from loaded_scenes import REST, apart, run
+from slow_cases import slow_after
 
 from sst_ros.scene.loads import Friction, JointFriction
 from sst_ros.scene.scene import load
@@ -56,7 +57,7 @@ def slowly(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
+@pytest.mark.parametrize("tolerance", slow_after(1, [1e-6, 1e-8]))
 @pytest.mark.parametrize(
     ("name", "method"),
     [

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from loaded_scenes import IGNORE, REST, loaded, run, viscous
+from slow_cases import slow_after
 
 from benchmark.plain_python import without_llvmlite
 from sst_ros.errors import (
@@ -192,7 +193,7 @@ def run_ticks(scene, at_once, ticks, tick=MILLISECOND, **how):
     return told(simulation), None, None
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_after(2, CASES))
 def test_the_bits_do_not_depend_on_how_many_ticks_go_into_a_call(name):
     scene, how = CASES[name]
     single = run_ticks(scene, 1, 120, **how)

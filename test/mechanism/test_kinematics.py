@@ -106,7 +106,7 @@ def folds(count, seed):
                 break
 
 
-@pytest.mark.parametrize("distance", [1e-4, 1e-8, 1e-11])
+@pytest.mark.parametrize("distance", slow_after(1, [1e-4, 1e-8, 1e-11]))
 def test_near_double_assemblies_on_both_sides_of_a_fold(distance):
     for geometry, gamma, direction in folds(6, seed=3):
         for sign in (-1, 1):

@@ -243,6 +243,7 @@ def test_a_process_may_fork_while_a_thread_compiles():
     """)
 
 
+@pytest.mark.slow
 def test_code_lives_as_long_as_a_function_that_uses_it():
     program = trace(lambda x: (x * 1.25,), ("x",))
     function = write_module({"f": program}).function("f")

@@ -274,6 +274,7 @@ def equations_of(scene, torque):
     return *equations.between(0.0, 1.0), equations.start()
 
 
+@pytest.mark.slow
 def test_without_rounding_a_motion_of_60_digits_is_missed(monkeypatch):
     scene, _ = case("general")
     motion = Motion(scene, SINE)
@@ -500,6 +501,7 @@ def test_the_reference_of_other_tests_lies_inside(name):
         assert (abs(found - columns[f"gamma_{leg}"]) <= bound).all()
 
 
+@pytest.mark.slow
 def test_torques_at_their_limit_are_clamped_exactly():
     scene = case("general")[0].with_values({"actuators": {"torque_limit": 0.5}})
     beyond, at = TorqueTable([0.0], [[0.5, -9.0, 0.1]]), (0.5, -0.5, 0.1)
@@ -573,6 +575,7 @@ def about_centre(**values):
     return load_scene("example2").with_values({**FREE, "star": star})
 
 
+@pytest.mark.slow
 def test_a_range_of_what_reading_converts_is_one_of_the_document():
     scene = about_centre()
     proven = certify(scene, ranges={"star.mass": 0.02}, **SHORT)
@@ -628,6 +631,7 @@ def test_the_length_of_what_may_be_zero_is_a_number():
         assert turn.is_finite() and turn.upper() < 1e-30
 
 
+@pytest.mark.slow
 def test_two_threads_prove_at_once():
     short = {"duration": 0.02, "t_eval": [0.02]}
     alone = certify("example2", **short).columns["angle"]

@@ -156,6 +156,7 @@ def test_the_figure_and_the_page_show_every_method_and_run(found):
     assert {"rk4", "dopri5", "dop853", "rodas5p: every step", "decay"} <= lines
 
 
+@pytest.mark.slow
 @needs("zstandard", "rosbags")
 def test_the_command_tells_its_time_and_writes_its_files(tmp_path, capsys):
     words = [

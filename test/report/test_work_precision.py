@@ -98,6 +98,7 @@ def test_the_reference_is_mpmaths_and_better_than_doubles(short):
     assert np.abs(run_extended(problem, 2)[2] - theirs).max() < 1e-17
 
 
+@pytest.mark.slow
 def test_methods_show_their_order(short):
     for method, order in (("rk4", 4), ("dopri5", 5), ("dop853", 8), ("rodas5p", 5)):
         rows = [

@@ -95,6 +95,7 @@ def test_samples_that_come_twice_or_late_are_told_apart():
     assert (follower.samples, follower.irregular) == (3, 1)
 
 
+@pytest.mark.slow
 def test_a_long_motion_keeps_no_more_than_a_short_one():
     follower = follow(hold=1e6)
     answers(follower, range(600))

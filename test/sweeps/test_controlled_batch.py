@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from scipy import stats
-from slow_cases import slow_after
+from slow_cases import slow_after, slow_except
 
 from sst_ros import load_scene, sweep
 from sst_ros.control.controller import Controller, Measurement, TrackingMetrics
@@ -50,7 +50,7 @@ def gaussian(seed, rows, counter):
     return normal_number(*uniform[2 * number : 2 * number + 2])
 
 
-@pytest.mark.parametrize("by", ["NumPy", "machine code"])
+@pytest.mark.parametrize("by", slow_except(["machine code"], ["NumPy", "machine code"]))
 @pytest.mark.parametrize(
     "case", slow_after(1, CASES), ids=lambda case: "-".join(map(str, case.values()))
 )

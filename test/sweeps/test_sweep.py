@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from slow_cases import slow_after
 
 import sst_ros
 from sst_ros import InputError, Simulation, load_scene, simulate
@@ -66,7 +67,7 @@ def test_early_ends_have_their_reason(table):
     assert np.all(ended["fault_time"] <= ended["t"] + 1.0 / 40 + 1e-12)
 
 
-@pytest.mark.parametrize("changes", [{"chunk": 300}, {"chunk": 17}])
+@pytest.mark.parametrize("changes", slow_after(1, [{"chunk": 300}, {"chunk": 17}]))
 def test_neither_chunks_nor_workers_change_a_bit(table, changes):
     study = dataclasses.replace(STUDY, **changes)
     same(run_study(study, None, workers=1 if changes["chunk"] == 17 else 3), table)
@@ -181,6 +182,7 @@ def test_resume_computes_only_what_is_missing(table, tmp_path, monkeypatch):
         run_study(STUDY, out)
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_whole_files_and_the_study_resumes(
     table, tmp_path, monkeypatch
 ):
