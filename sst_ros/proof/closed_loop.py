@@ -12,13 +12,14 @@ directions, so that the feedback of later ticks takes them back.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sst_ros.control.actuator_space import REFERENCE_SIZES, Reference
+from sst_ros.control.actuator_space import REFERENCE_SIZES, Reference, name_parts
 from sst_ros.control.controller import Controller
+from sst_ros.control.law import Measurement
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import LEGS
 from sst_ros.mechanism.generic_math import (
@@ -75,11 +76,6 @@ _EXACT_INPUTS = {
     "limit": 1,
 }
 """Sizes of the exact numbers that a tick takes: reference, its torques, limit."""
-
-
-def name_parts(sizes: Mapping[str, int]) -> list[str]:
-    """Return names of the numbers of some parts."""
-    return [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
 
 
 def turn_near_zero(quaternion: Quadruple, unit_ball: Any) -> Triple:
@@ -215,7 +211,9 @@ class SampledLoop:
         legs = list(kernel.leg_motions(traced_scene.model, of["state"]))
         gamma = triple(kernel.joint_angle(leg, 0) for leg in legs)
         gamma_dot = triple(leg.gamma_dot for leg in legs)
-        measured = add(gamma, of["angle_noise"]), add(gamma_dot, of["rate_noise"])
+        measured = Measurement(
+            add(gamma, of["angle_noise"]), add(gamma_dot, of["rate_noise"])
+        )
         observed = quaternion_product(of["guess"], (*of["turn"], 1.0))
         model = kernel.model_of(self._controller.model)
 
@@ -231,7 +229,7 @@ class SampledLoop:
         scheme = scheme._replace(limit=limit, turn=turn)
         desired = Reference(**{name: of[name] for name in REFERENCE_SIZES})
         torques = of["feedforward"], of["held"]
-        command = scheme.answer(desired, torques, *measured, observed, of["integral"])
+        command = scheme.answer(desired, torques, measured, observed, of["integral"])
         error = axpy(1.0, desired.gamma, -1.0, gamma)
         return [*command.torque, *command.integral, *error]
 
