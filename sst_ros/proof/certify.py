@@ -118,16 +118,15 @@ PROOF_ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
 NEXT_TOLERANCE = 0.1  # of the next proof, as a share of what would just do
 
 # Signs that say when a limit may be met.
-LIMIT_ORDER = 6  # of expansions whose signs say where limits are
+LIMIT_ORDER = 6  # of expansions of the numbers
 SPLITS = 200  # of a step, most of them near a limit
 TURN_SPLITS = 80  # of a step in which a joint may turn back: a joint may be at rest
 SHORTEST_SPAN = 1e-10  # of a step: it is not split, whatever is known of its signs
 
-# Search for narrower ranges that would do.
-# how often ranges are halved where a width is looked for that would do; then bisected
+# Search for narrower ranges that would do: they are halved so often, then bisected.
 HALVINGS = (1, 2, 4, 8, 16, 32)
 SHARE_DIGITS = 3  # of a share of a width that would do
-# most steps of a proof with narrower ranges: so many times those without, and some
+# Most steps of a proof with narrower ranges: so many times those without, and some.
 NARROW_STEPS = 4
 SPARE_STEPS = 10
 

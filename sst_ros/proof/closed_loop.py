@@ -11,7 +11,6 @@ directions, so that the feedback of later ticks takes them back.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -67,7 +66,7 @@ FAR = "the error on SO(3) may exceed what the series of its logarithm is proven 
 
 _NOISE_SIZES = {"angle_noise": LEGS, "rate_noise": LEGS}
 NOISES = sum(_NOISE_SIZES.values())
-_UNKNOWN_SIGNS = {"unit_ball": 1}  # a ball from -1 to 1, see `turn_near_zero`
+_UNIT_BALL = {"unit_ball": 1}  # a ball from -1 to 1, see `turn_near_zero`
 _EXACT_INPUTS = {
     "guess": 4,
     **REFERENCE_SIZES,
@@ -193,13 +192,13 @@ class SampledLoop:
             **_NOISE_SIZES,
             "turn": 3,
         }
-        self._sizes = moving_sizes | _EXACT_INPUTS | _UNKNOWN_SIGNS
+        self._sizes = moving_sizes | _EXACT_INPUTS | _UNIT_BALL
         self._slope_sizes = moving_sizes | {"varied": len(balls.inputs)}
         by = (*name_parts(moving_sizes), *balls.inputs)
         self._respond = balls.compile(self._law, name_parts(self._sizes), by)
         self._measure = balls.compile(_angles, state, (*state, *balls.inputs))
         # Where the orientation at the next tick is looked for from.
-        start = controller.desire(0.0)[0]
+        start, _, _ = controller.desire(0.0)
         self._last_assembly = start.quaternion, start.gamma
         self._loops = self._compile_loops() if self._settings.observes else None
         self._limit = controller.law_with(_none, _none).limit
@@ -311,13 +310,13 @@ class SampledLoop:
         exact_inputs = [arb(x) for name in _EXACT_INPUTS for x in numbers[name]]
 
         def run(
-            point: Sequence[Any], measured_off: Sequence[Any], turn: Sequence[Any]
+            point: Sequence[Any], measurement_noise: Sequence[Any], turn: Sequence[Any]
         ) -> list[list[Any]]:
             """Return the values of the law, then its slopes by each input."""
             state_and_memory = *point[self._places.state], *point[self._places.memory]
             flat = self._respond(
                 *state_and_memory,
-                *measured_off,
+                *measurement_noise,
                 *turn,
                 *exact_inputs,
                 between(-1, 1),
@@ -343,9 +342,9 @@ class SampledLoop:
     ) -> _Response:
         """Return the slopes of the law by the region and by the noise.
 
-        Given are those of all values by each input. Those by the turn are chained with
-        the slopes of the turn by the measured angles, and these with the slopes of the
-        angles by the region.
+        Those by each input, of all values, are `slopes`. Those by the turn are chained
+        with the slopes of the turn by the measured angles, and these with the slopes of
+        the angles by the region.
         """
         response = _Response(values, [], [], [])
         turn_by_each_angle = list(zip(*observed.by_angles.tolist(), strict=True))
@@ -606,4 +605,4 @@ def _angles(traced_scene: Parts, *state: Any) -> list[Any]:
 
 def _none(*_: Any) -> Any:
     """Stand for a function that is not called."""
-    raise AssertionError(math.nan)
+    raise AssertionError("a function of the model is called")

@@ -75,8 +75,7 @@ LAST_STEP = 1.01  # a step that is shorter than the time left by less takes all 
 LEAST_STEP = 1e-9  # of a step, relative to the whole time: the proof ends
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
 KINK_STEPS = 400  # steps across one kink before the proof ends
-# of a set in a step across a kink, below which the next is twice as long
-KINK_LOSS = 0.02
+KINK_LOSS = 0.02  # of a set in a step across a kink: below it the next is longer
 KINK_HALVINGS = 30  # of the time in which a kink is looked for
 
 CUT = "an angle may pass pi, where that of the model jumps"
@@ -84,7 +83,14 @@ UNBOUNDED = "a number is not bounded: a singularity may be near"
 
 
 class Refused(ArithmeticError):
-    """A step is not proven: how much shorter, or in what wider tube, it may be."""
+    """A step is not proven.
+
+    Attributes:
+        shorter: length of the next try, as a share of that of the step.
+        wider: tube in which the step may be proven as it is; None where that is in
+            vain.
+
+    """
 
     def __init__(
         self, reason: str, shorter: float = 0.5, wider: list[Any] | None = None
@@ -496,8 +502,9 @@ def approximate(
 ) -> list[list[Any]]:
     """Return the coefficients of p.
 
-    With k of them, the series of f(t, p) gives the next one. Those that follow it take
-    up what the new ones add to the series, which is linear: J on what was known.
+    The series of f(t, p) gives the next coefficient, and nearly those after it: what
+    new coefficients add to the series is linear in them, by the Jacobian on the part of
+    p that was known.
     """
     n = len(region.centre)
     p = [[x] for x in region.centre]

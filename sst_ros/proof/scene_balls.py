@@ -465,7 +465,8 @@ class SceneBalls:
     def _convert_in_balls(self) -> dict[Place, NumberReading | float]:
         """Convert the document in balls; return the results that no range touches.
 
-        What is exactly 0, 1 or -1 is a float: programs lose such factors.
+        A result that is exactly 0, 1 or -1 is a float, which programs drop as a term or
+        a factor.
         """
         places: list[Place] = []
         varied = [f"p{i}" for i in range(len(self._varied))]
