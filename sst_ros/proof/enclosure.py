@@ -59,18 +59,33 @@ SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogon
 REMAINDER_GROWTH = 0.05  # of a set by the remainder of V, largest in a step
 LOSS = 1e-4  # of a set in a step, relative to it: shorter steps are tried beyond it
 UNSEEN = 0.01  # share of the tolerance below which a step may widen the set
+MUCH_LESS = 0.2  # loss of a shorter step that is worth it, relative to the longer one's
+# Weights of a norm are found by power iteration: its steps, what of the last weights is
+# kept in each so that it converges, and the least weight by the largest.
+WEIGHT_STEPS = 20
+KEPT_WEIGHT = 1e-3
+LEAST_WEIGHT = 1e-9
 
 # Tubes, wider than what they are around.
 ROOM = 3  # around a region, times it
 MOST_ROOM = 100  # the same where steps need more
 TIGHT = 1.1  # around what a step was proven to reach, times that
 TUBE_TRIES = 4  # wider tubes for a step before it is made shorter
+# times the tolerance: a wider tube is not tried for an error that grows more in a step
+SLOW_GROWTH = 10.0
 
 # Lengths of steps: they decide how long a proof takes, not what is true.
-FIRST_FACTOR = 0.4  # first step by the longest that its series allows
+FIRST_FACTOR = 0.4  # first step by the longest that its series allows, see `_plan`
 GROWTH = 4.0  # longest next step by the usual one
 REGAIN = 1.25  # longest next step by the last one, after a step was refused
 SHORTER = 0.6  # next try by the last one, where a set grows too much
+DEFECT_MARGIN = 0.9  # next try by what should just do, where the defect is too large
+LEAST_SHORTER = 0.2  # next try by the last one, at least
+AIM = 0.5  # defect that the next step is to have, relative to the tolerance
+# Change of this factor from a step to the next.
+LEAST_CHANGE = 0.7
+MOST_CHANGE = 1.3
+LEAST_USUAL = 0.1  # by which a single short step makes the usual one shorter, at most
 LAST_STEP = 1.01  # a step that is shorter than the time left by less takes all of it
 LEAST_STEP = 1e-9  # of a step, relative to the whole time: the proof ends
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
@@ -670,7 +685,7 @@ def _measure_defect(
         excess = last / tolerance
         shorter = 0.5
         if excess < math.inf:
-            shorter = max(0.9 * excess ** (-1.0 / order), 0.2)
+            shorter = max(DEFECT_MARGIN * excess ** (-1.0 / order), LEAST_SHORTER)
         raise Refused("the defect is too large", shorter)
     return step
 
@@ -731,7 +746,7 @@ def _check_tube(step: Advance, tolerance: float) -> Advance:
     widest = max(_largest(at_begin, moving), _largest(at_end, moving))
     growth = max(map(float, entries(step.w)))
     wider = None
-    if growth < 10.0 * tolerance + REMAINDER_GROWTH * widest:
+    if growth < SLOW_GROWTH * tolerance + REMAINDER_GROWTH * widest:
         wider = around_zero([2 * x for x in reached[:moving]]) + step.tube[moving:]
     raise Refused("the error may leave the tube: it grows too fast", SHORTER, wider)
 
@@ -747,9 +762,9 @@ def _weights(jacobian: Any) -> list[Any]:
     weights = np.ones(len(jacobian.tolist()))
     if not np.all(np.isfinite(size)):
         raise Refused(UNBOUNDED)
-    for _ in range(20):
-        weights = size @ weights + 1e-3 * weights
-        weights = np.maximum(weights / weights.max(), 1e-9)
+    for _ in range(WEIGHT_STEPS):
+        weights = size @ weights + KEPT_WEIGHT * weights
+        weights = np.maximum(weights / weights.max(), LEAST_WEIGHT)
     return [arb(x) for x in weights.tolist()]
 
 
@@ -944,7 +959,7 @@ class ProvenSteps:
                 shorter = self._prove(step._replace(end=end, tube=tube))
             except (ArithmeticError, ValueError):
                 return step
-            if _loss(shorter) > 0.2 * _loss(step):
+            if _loss(shorter) > MUCH_LESS * _loss(step):
                 return step
             step = shorter
         return step
@@ -971,17 +986,17 @@ class ProvenSteps:
         """Choose what the length of the next step is made from."""
         if self._region.time + taken >= self._end:
             return
-        self._usual = max(taken, 0.1 * self._usual)
+        self._usual = max(taken, LEAST_USUAL * self._usual)
         if self._most < math.inf:
             self._most = REGAIN * taken
         if not is_free:
             return
         self._cruise = self._usual
-        # The next defect is to be half of the tolerance.
-        ratio = 1.3
+        change = MOST_CHANGE
         if defect:
-            ratio = (0.5 * self._tolerance / defect) ** (1.0 / self._order)
-        self._factor = taken / longest * min(max(ratio, 0.7), 1.3)
+            change = (AIM * self._tolerance / defect) ** (1.0 / self._order)
+        change = min(max(change, LEAST_CHANGE), MOST_CHANGE)
+        self._factor = taken / longest * change
 
     def _clear_length(self, step: Advance) -> float:
         """Return how long no kink is near, nearly, by halving a step that has one."""
