@@ -320,9 +320,9 @@ def move_actuators(
             f"{cause}, least singular value of J2", error.measure
         ) from error
     quaternions = quaternion_of(rotations)
-    # Their signs change as little as they can.
-    turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
-    signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))
+    # Of the two signs each has that of the quaternion before it.
+    cosines = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
+    signs = np.cumprod(np.where(cosines < 0.0, -1.0, 1.0))
     orientations = map(tuple, (signs[:, None] * quaternions).tolist())
     rows = zip(times, orientations, gammas, sigmas.tolist(), strict=True)
     kept = [KeptOrientation(*row) for row in rows]
@@ -447,18 +447,17 @@ def through_points(
     nothing in place of a row) are zero at the ends and chosen for minimum jerk between
     them. Raises InputError for points that make no motion, and as `move_actuators`.
     """
-    checks: list[Check] = [
-        ("points", len(times), len(times) > 0, "must be one or more")
-    ]
-    names = "times", "positions", "velocities", "accelerations"
-    columns = [[time] for time in times], positions, velocities, accelerations
-    rows = [
-        _read_rows(name, column, len(times), checks)
-        for name, column in zip(names, columns, strict=True)
-    ]
+    count = len(times)
+    checks: list[Check] = [("points", count, count > 0, "must be one or more")]
+    time_rows = _read_rows("times", [[time] for time in times], count, checks)
+    position_rows = _read_rows("positions", positions, count, checks)
+    velocity_rows = _read_rows("velocities", velocities, count, checks)
+    acceleration_rows = _read_rows("accelerations", accelerations, count, checks)
     refuse_unless("trajectory", *checks)
-    point_times, gamma, rates, second_rates = map(np.array, rows)
-    point_times = point_times.ravel()
+    point_times = np.array(time_rows).ravel()
+    gamma = np.array(position_rows)
+    rates = np.array(velocity_rows)
+    second_rates = np.array(acceleration_rows)
     refuse_unless("trajectory", *_check_points(point_times, rates))
     start_gamma = kinematics.inverse(geometry, rotation_matrix(start))[0]
     if point_times[0] > 0.0:
