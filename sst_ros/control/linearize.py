@@ -24,13 +24,7 @@ import numpy as np
 from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import GRAZING, limits_of
-from sst_ros.dynamics.traced_dynamics import (
-    LEGS,
-    QUATERNION_SYMBOLS,
-    STATE_SIZE,
-    Dynamics,
-    recent_ode,
-)
+from sst_ros.dynamics.traced_dynamics import LEGS, Dynamics, recent_ode
 from sst_ros.dynamics.variational import trace_derivatives
 from sst_ros.errors import SingularConfiguration, check_kinds, refuse_unless, require
 from sst_ros.integration.held_flow import HeldFlow, follow_held_torque, states_inside
@@ -38,6 +32,9 @@ from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.state import (
+    QUATERNION,
+    STAR,
+    STAR_RATE,
     ZERO,
     Array,
     Explained,
@@ -56,13 +53,7 @@ _MOST_PERIOD_EVALUATIONS = 20_000
 _CHECKS = 8  # parts of a period, after each of which limits are checked
 # A state this near to one of rest [rad], by the largest entry of A, counts as one.
 _REST = 1e-9
-
-# Places in a state.
-_QUATERNION = slice(0, len(QUATERNION_SYMBOLS))
-_BODY_RATE = slice(len(QUATERNION_SYMBOLS), STATE_SIZE)
-_MOTION = slice(0, STATE_SIZE)
-# Places in the coordinates of the star.
-_ROTATION = slice(0, 3)
+_ROTATION_VECTOR = slice(0, 3)  # place in the coordinates of the star
 
 
 @dataclass(frozen=True, repr=False)
@@ -133,7 +124,7 @@ def equilibrium(scene: SceneInput, gamma: Any) -> State:
     """
     scene_at_rest = with_initial(scene_of(scene), (gamma, ZERO))
     y = start_of(scene_at_rest)
-    torque = InverseDynamics(scene_at_rest).gravity_torque(y[_QUATERNION])
+    torque = InverseDynamics(scene_at_rest).gravity_torque(y[QUATERNION])
     return State.of(0, y, Dynamics.of(scene_at_rest).joints(*y), torque)
 
 
@@ -173,8 +164,8 @@ def linearize(
     start = _start_of(scene, state, acting)
     by_gamma = coordinates == "gamma"
     if by_gamma:
-        x, y, z, w = start[_QUATERNION].tolist()
-        body_rate = triple(start[_BODY_RATE].tolist())
+        x, y, z, w = start[QUATERNION].tolist()
+        body_rate = triple(start[STAR_RATE].tolist())
         # It refuses singularities.
         InverseDynamics(scene).torque((x, y, z, w), body_rate, ZERO)
     dynamics = Dynamics.of(scene)
@@ -229,7 +220,7 @@ def _start_of(scene: Scene, state: Any, commanded: Vector3) -> Array:
         motion = [*state.quaternion, *state.body_rate]
         lagged = state.torque
     else:
-        motion = [*start_of(with_initial(scene, state))[_MOTION]]
+        motion = [*start_of(with_initial(scene, state))[STAR]]
         lagged = commanded
     return np.array([*motion, *lagged] if scene.lags else motion)
 
@@ -271,7 +262,7 @@ def _find_limit(
         *states_inside(recent_ode(dynamics), flow, torque, inside),
         flow.states[-1],
     ]
-    joints = [dynamics.joints(*y[_MOTION].tolist()) for y in states]
+    joints = [dynamics.joints(*y[STAR].tolist()) for y in states]
     for limit in limits_of(scene, Geometry.of(scene)):
         distances = np.array([limit.distance(numbers) for numbers in joints])
         if distances[0] >= -GRAZING and distances.min() < -GRAZING:
@@ -320,7 +311,7 @@ def _differentiate(
     slope_by_y, slope_by_torque = np.split(slopes, [size], axis=1)
     a = slope_by_y @ from_star
     # In the turning frame d' = dW - W x d.
-    a[_ROTATION, _ROTATION] = np.cross(y[_BODY_RATE], np.eye(3))
+    a[_ROTATION_VECTOR, _ROTATION_VECTOR] = np.cross(y[STAR_RATE], np.eye(3))
     return _Derivatives(to_star, from_star, a, slope_by_torque, rows[0])
 
 
@@ -346,12 +337,12 @@ def _turns(y: Array) -> tuple[Array, Array]:
     1).
     """
     size = len(y)
-    q = y[_QUATERNION]
+    q = y[QUATERNION]
     by_axis = [quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]
     turn = np.array(by_axis).T
     # A quaternion has one number more than the rotation; all else is the same.
     from_star = np.eye(size, size - 1, -1)
-    from_star[_QUATERNION, _ROTATION] = turn
+    from_star[QUATERNION, _ROTATION_VECTOR] = turn
     to_star = np.eye(size - 1, size, 1)
-    to_star[_ROTATION, _QUATERNION] = 4.0 * turn.T / (q @ q)
+    to_star[_ROTATION_VECTOR, QUATERNION] = 4.0 * turn.T / (q @ q)
     return from_star, to_star

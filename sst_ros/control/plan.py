@@ -54,14 +54,14 @@ DEMAND_UNITS = {
 
 Power is negative where the actuator brakes.
 """
-_TORQUES = slice(0, LEGS)  # among the demands of three actuators, quantity by quantity
+_DEMANDED_TORQUES = slice(0, LEGS)  # of three actuators, among demands
 # Share of a maximum by which another must exceed it: less is rounding.
 _MAXIMUM_ROUNDING = 1e-13
 _REFINEMENT = 1e-8  # of the time of a maximum, as a share of what it is sought in
 # Places of the first of three, and of det J2, in what `_distances` measures.
-_GAMMA = 0
-_SIN_MU = 3
-_BETA = 6
+_GAMMA_1 = 0
+_SIN_MU_1 = 3
+_BETA_1 = 6
 _DET_J2 = 9
 
 
@@ -154,7 +154,7 @@ def examine_motion(
         return (*torque, *power, *reference.gamma_dot, *reference.gamma_ddot)
 
     samples, find = _sample(motion, measure, times, desired)
-    torques = samples[:, _TORQUES]
+    torques = samples[:, _DEMANDED_TORQUES]
     peaks: dict[str, list[Peak]] = {}
     for quantity, name in enumerate(DEMAND_UNITS):
         floor = -math.inf if exact else limits.get(name, math.inf)
@@ -333,10 +333,10 @@ def _distances(
 
     in_stroke = scene.stroke.at_end != "ignore"
     in_workspace = scene.workspace.at_edge != "ignore"
-    yield from between("gamma", _GAMMA, geometry.arc.tolist(), in_stroke)
-    yield from between("beta", _BETA, [geometry.beta_max] * LEGS, in_workspace)
+    yield from between("gamma", _GAMMA_1, geometry.arc.tolist(), in_stroke)
+    yield from between("beta", _BETA_1, [geometry.beta_max] * LEGS, in_workspace)
     for leg in (1, 2, 3):
-        low = reach(_SIN_MU + leg - 1, SINGULAR_MU, 1.0)
+        low = reach(_SIN_MU_1 + leg - 1, SINGULAR_MU, 1.0)
         if low.value < SINGULAR_MU:
             cause = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(cause, low.value)

@@ -30,7 +30,6 @@ from sst_ros.dynamics.motion_table import JOINT_QUANTITIES
 from sst_ros.dynamics.traced_dynamics import (
     LEGS,
     MOTION,
-    QUATERNION_SYMBOLS,
     RATE_SYMBOLS,
     STATE_SIZE,
     TORQUE_SYMBOLS,
@@ -90,7 +89,14 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained, cached_property
+from sst_ros.state import (
+    NANOSECONDS,
+    QUATERNION,
+    STAR,
+    STAR_RATE,
+    Explained,
+    cached_property,
+)
 
 PARALLEL = "parallel singularity, det J2 = 0"
 KNOWN_TORQUES = "must be numbers, sines, a table, polynomials or a Controller"
@@ -105,10 +111,7 @@ _UNKNOWN_SIZES = {"turn": len(TURN_SYMBOLS), "body_rate": len(RATE_SYMBOLS)}
 _START_SIZES = {**_UNKNOWN_SIZES, "gamma": LEGS, "gamma_dot": LEGS}
 _UNIT_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
-# Places in the state.
-QUATERNION = slice(0, len(QUATERNION_SYMBOLS))
-BODY_RATE = slice(len(QUATERNION_SYMBOLS), STATE_SIZE)
-JOINT_COUNT = len(JOINT_QUANTITIES) * LEGS  # angles and rates of the joints
+ANGLES_AND_RATES = len(JOINT_QUANTITIES) * LEGS  # angles and rates of the joints
 
 # Choice of steps: it decides how long a proof takes, not what is true.
 ORDER_PER_DIGIT = 1.6  # order of p over the digits of the tolerance, rounded up
@@ -189,7 +192,7 @@ class BallEquations:
         that are ranges. Raises Refused where the start is not proven to be the only one
         near.
         """
-        x, y, z, w, *body_rate = start_of(self.scene)[:STATE_SIZE]
+        x, y, z, w, *body_rate = start_of(self.scene)[STAR]
         orientation = (x, y, z, w)
         inputs = (*TURN_SYMBOLS, *RATE_SYMBOLS, *GAMMA_SYMBOLS, *ANGLE_RATES)
         run = self.balls.compile(
@@ -651,7 +654,7 @@ class Follower:
         p, error_bounds = step.at(time)
         q = p[QUATERNION]
         balls = [
-            *zip(p[BODY_RATE], error_bounds[BODY_RATE], strict=True),
+            *zip(p[STAR_RATE], error_bounds[STAR_RATE], strict=True),
             *self._joint_balls(step, time, p, error_bounds),
         ]
         values = []
@@ -685,17 +688,17 @@ class Follower:
             in_box = self._equations.joints(
                 *(arb(p[i], error_bounds[i]) for i in inputs)
             )
-            _, *slopes = rows_of(in_box, JOINT_COUNT)
+            _, *slopes = rows_of(in_box, ANGLES_AND_RATES)
             slopes_by_place = dict(zip(inputs, slopes, strict=True))
-            no_slopes = [arb(0)] * JOINT_COUNT
+            no_slopes = [arb(0)] * ANGLES_AND_RATES
             by_state = from_columns(
                 [slopes_by_place.get(place, no_slopes) for place in range(len(p))]
             )
             _, joint_bounds = step.at(time, by_state)
         except Refused:  # an angle passes pi
-            half = JOINT_COUNT // 2
+            half = ANGLES_AND_RATES // 2
             return [(0, arb.pi())] * half + [(0, arb("inf"))] * half
-        return list(zip(at_middle[:JOINT_COUNT], joint_bounds, strict=True))
+        return list(zip(at_middle[:ANGLES_AND_RATES], joint_bounds, strict=True))
 
 
 def unite(proofs: Sequence[Follower]) -> tuple[list[Row], dict[str, list[SignSpan]]]:

@@ -81,12 +81,12 @@ REGAIN = 1.25  # longest next step by the last one, after a step was refused
 SHORTER = 0.6  # next try by the last one, where a set grows too much
 DEFECT_MARGIN = 0.9  # next try by what should just do, where the defect is too large
 LEAST_SHORTER = 0.2  # next try by the last one, at least
-AIM = 0.5  # defect that the next step is to have, relative to the tolerance
+DEFECT_AIM = 0.5  # defect that the next step is to have, relative to the tolerance
 # Change of this factor from a step to the next.
 LEAST_CHANGE = 0.7
 MOST_CHANGE = 1.3
 LEAST_USUAL = 0.1  # by which a single short step makes the usual one shorter, at most
-LAST_STEP = 1.01  # a step that is shorter than the time left by less takes all of it
+END_MARGIN = 1.01  # a step that is shorter than the time left by less takes all of it
 LEAST_STEP = 1e-9  # of a step, relative to the whole time: the proof ends
 KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
 KINK_STEPS = 400  # steps across one kink before the proof ends
@@ -864,7 +864,6 @@ class ProvenSteps:
         self._usual = self._span  # length of steps of late
         self._cruise = self._span  # the same before a kink was near
         self._most = math.inf  # largest length of the next step
-        self.kinks: list[tuple[float, float]] = []  # spans of time across kinks [s]
 
     def __iter__(self) -> Iterator[Advance]:
         """Yield the steps."""
@@ -894,7 +893,7 @@ class ProvenSteps:
         tries = 0
         while True:
             target = region.time + h
-            if region.time + LAST_STEP * h > self._end:
+            if region.time + END_MARGIN * h > self._end:
                 target = self._end
             step = Advance(region, target, polynomials, tube)
             try:
@@ -994,7 +993,7 @@ class ProvenSteps:
         self._cruise = self._usual
         change = MOST_CHANGE
         if defect:
-            change = (AIM * self._tolerance / defect) ** (1.0 / self._order)
+            change = (DEFECT_AIM * self._tolerance / defect) ** (1.0 / self._order)
         change = min(max(change, LEAST_CHANGE), MOST_CHANGE)
         self._factor = taken / longest * change
 
@@ -1018,7 +1017,6 @@ class ProvenSteps:
 
         Each is twice as long as the one before, unless it loses much.
         """
-        begin = self._region.time
         h = KINK_STEP * self._span
         factor = self._factor
         cruise = self._cruise
@@ -1041,7 +1039,6 @@ class ProvenSteps:
             break
         else:
             raise Refused(f"{kink}, for longer than {KINK_STEPS} steps")
-        self.kinks.append((begin, step.end))
         self._usual = cruise
         self._cruise = cruise
         self._factor = factor

@@ -19,7 +19,7 @@ from sst_ros.proof.balls import (
 from sst_ros.proof.enclosure import Function, Refused
 
 # Newton's method doubles the digits in a step: a guess in doubles needs two or three.
-NEWTON_STEPS = 6
+ROOT_NEWTON_STEPS = 6
 INFLATIONS = 6  # of the box in which the root is looked for
 LEAST_RADIUS = 2.0 ** (8 - PRECISION)  # of that box: rounding alone is not wider
 
@@ -65,7 +65,7 @@ def krawczyk(
         )
 
     root = column(list(map(arb, guess)))
-    for _ in range(NEWTON_STEPS):
+    for _ in range(ROOT_NEWTON_STEPS):
         at_root = linearize(root, fixed)
         inverse = at_root.by_unknowns.mid().inv().mid()
         root = (root - inverse * at_root.values).mid()
