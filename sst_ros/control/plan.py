@@ -54,7 +54,7 @@ DEMAND_UNITS = {
 
 Power is negative where the actuator brakes.
 """
-_DEMANDED_TORQUES = slice(0, LEGS)  # of three actuators, among demands
+_DEMANDED_TORQUES = slice(0, LEGS)  # places in the demands of a sample
 # Share of a maximum by which another must exceed it: less is rounding.
 _MAXIMUM_ROUNDING = 1e-13
 _REFINEMENT = 1e-8  # of the time of a maximum, as a share of what it is sought in

@@ -111,7 +111,7 @@ _UNKNOWN_SIZES = {"turn": len(TURN_SYMBOLS), "body_rate": len(RATE_SYMBOLS)}
 _START_SIZES = {**_UNKNOWN_SIZES, "gamma": LEGS, "gamma_dot": LEGS}
 _UNIT_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
-ANGLES_AND_RATES = len(JOINT_QUANTITIES) * LEGS  # angles and rates of the joints
+ANGLES_AND_RATES = len(JOINT_QUANTITIES) * LEGS  # numbers of all joints
 
 # Choice of steps: it decides how long a proof takes, not what is true.
 ORDER_PER_DIGIT = 1.6  # order of p over the digits of the tolerance, rounded up
