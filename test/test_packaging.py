@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from colcon_choice import ON_A_PLATFORM
 
 import sst_ros
 from sst_ros.cli.commands import NODE_HELP
@@ -112,6 +113,13 @@ def test_every_extra_that_a_message_names_brings_the_module():
 def test_every_node_has_an_executable_for_ros2_run():
     assert {path.name for path in (ROOT / "executables").iterdir()} == set(NODE_HELP)
     assert all(os.access(ROOT / "executables" / name, os.X_OK) for name in NODE_HELP)
+
+
+def test_colcon_runs_files_that_exist():
+    """A name that is wrong would end `colcon test` before its first test."""
+    missing = [name for name in ON_A_PLATFORM if not (ROOT / "test" / name).exists()]
+    assert not missing
+    assert len(ON_A_PLATFORM) == len(set(ON_A_PLATFORM))
 
 
 @pytest.fixture(scope="module")
