@@ -122,6 +122,12 @@ def test_colcon_runs_files_that_exist():
     assert len(ON_A_PLATFORM) == len(set(ON_A_PLATFORM))
 
 
+def test_colcon_measures_no_coverage(setup_arguments):
+    """It does where the extra `test` names pytest-cov, which ROS's tools bring."""
+    extras = setup_arguments["extras_require"]
+    assert not [word for word in extras["test"] if word.startswith("pytest-cov")]
+
+
 @pytest.fixture(scope="module")
 def depends():
     root = ET.parse(ROOT / "package.xml").getroot()
@@ -129,14 +135,21 @@ def depends():
 
 
 @pytest.fixture(scope="module")
-def required():
-    """Names of Python packages that setup.py asks for, without the wheels of ROS."""
+def setup_arguments():
+    """What setup.py gives to setuptools."""
     given = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         patch.setattr("setuptools.setup", given.update)
         runpy.run_path("setup.py")
-    words = [*given["install_requires"], *given["extras_require"]["all"]]
+    return given
+
+
+@pytest.fixture(scope="module")
+def required(setup_arguments):
+    """Names of Python packages that setup.py asks for, without the wheels of ROS."""
+    extras = setup_arguments["extras_require"]
+    words = [*setup_arguments["install_requires"], *extras["all"]]
     names = {re.match(r"[\w-]+", word)[0] for word in words}
     return {name for name in names if not name.startswith("ros-")}
 
