@@ -160,7 +160,11 @@ class InverseDynamics(Explained):
             inertia, reach = self._reduce(self._orientation(at))
         else:
             self._torques_at_rest(quaternions)  # refuses singularities
-            numbers = self._dynamics.reduced_inertia_of_rows(quaternions)
+            # Pose by pose in memory, as one pose is: NumPy 1.26 multiplies matrices of
+            # another layout without BLAS, which rounds otherwise.
+            numbers = np.ascontiguousarray(
+                self._dynamics.reduced_inertia_of_rows(quaternions)
+            )
             inertia, reach = np.split(numbers.reshape(-1, 6, 3), 2, axis=1)
         back = np.linalg.inv(reach)
         mass = np.swapaxes(back, -1, -2) @ inertia @ back

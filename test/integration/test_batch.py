@@ -221,9 +221,12 @@ def test_an_interrupt_ends_a_batch_at_once(threads):
     with subprocess.Popen(
         program, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as run:
-        assert run.stdout.readline() == b"runs\n"
-        run.send_signal(signal.SIGINT)
-        _, said = run.communicate(timeout=20)  # without it the run would take hours
+        try:
+            assert run.stdout.readline() == b"runs\n"
+            run.send_signal(signal.SIGINT)
+            _, said = run.communicate(timeout=20)
+        finally:
+            run.kill()  # without an interrupt the run would take hours
     assert b"KeyboardInterrupt" in said
 
 
