@@ -7,8 +7,8 @@ ROS ?= ros
 EXTRAS = $(ROS),record,plot,fast,proof
 PYTEST = $(RUN) -m pytest
 PARALLEL = --numprocesses auto --dist loadfile
-# The tests of the nodes wait two thirds of their time.
-PARALLEL_NODES = --numprocesses $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder
+# The tests of the nodes wait two thirds of their time, and each worker imports ROS.
+PARALLEL_NODES = --numprocesses $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder
 # Python compiles what is imported; pip would compile all 15,000 files.
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
 # Where the environment forbids to keep it, each of some hundred processes compiles NumPy anew.
@@ -46,7 +46,7 @@ view: $(VENV)/.view  ## show a simulation in the browser
 
 test: $(VENV)/.test lint  ## run the tests, without the slow ones
 	$(PYTEST) $(PARALLEL) $(COVERAGE) -m "not slow" --ignore test/ros
-	$(PYTEST) $(PARALLEL_NODES) -m "not slow" test/ros
+	$(PYTEST) $(PARALLEL_NODES) -m "not slow and not breadth" test/ros
 
 test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment of their own
 	$(MAKE) test-ros VENV=.venv-jazzy ROS=jazzy
@@ -56,7 +56,7 @@ test-ros: $(VENV)/.ros  ## run the tests of the nodes
 
 test-slow: $(VENV)/.test $(VENV)/.docs  ## run the slow tests: sweeps, long pages, packages, fresh environments
 	$(PYTEST) $(PARALLEL) -m slow --ignore test/ros --timeout 600
-	$(PYTEST) $(PARALLEL) -m slow test/ros --timeout 600
+	$(PYTEST) $(PARALLEL) -m "slow or breadth" test/ros --timeout 600
 
 # Lines and branches that the tests without nodes pass, those of child processes not counted.
 test-all: COVERAGE = --cov sst_ros --cov-branch --cov-report term

@@ -6,6 +6,7 @@ import pytest
 from identification import manipulators
 from identification.test_consistency import of_points
 from models import star_orientation
+from slow_cases import slow_after
 
 from sst_ros import load_scene, reference_motion
 from sst_ros.control.plan import examine_motion
@@ -138,9 +139,10 @@ def designed():
     return scene, design(scene, duration=4.0, harmonics=4, iterations=15)
 
 
-@pytest.mark.slow
-def test_a_designed_motion_keeps_limits_and_rests_at_both_ends(designed):
-    _, found = designed
+@pytest.mark.parametrize("iterations", slow_after(1, [2, 15]))
+def test_a_designed_motion_keeps_limits_and_rests_at_both_ends(iterations):
+    scene = load_scene("reach").with_values(LIMITS)
+    found = design(scene, duration=4.0, harmonics=4, iterations=iterations)
     motion = reference_motion(found.scene)
     assert examine_motion(motion, found.scene).problems == ()
     for time in (0.0, motion.duration):

@@ -358,6 +358,20 @@ def test_polynomials_are_followed_over_their_pieces():
         assert worst(proven.columns, motion, piece, time) < 1.0
 
 
+def test_a_proof_ends_at_a_limit_where_simulate_stops():
+    start = {"gamma": (1.5, 0.8, 0.8), "gamma_dot": (2.0, -0.5, -0.5)}
+    scene = load_scene("example2_stroke").with_values({"initial": start})
+    proven, found = (
+        certify(scene, duration=0.02, t_eval=[0.005, 0.01]),
+        simulate(scene, duration=0.02),
+    )
+    (span,) = proven.limits["beta_2 < 0"]
+    assert proven.reason == "beta_2 < 0" and proven.success
+    assert proven.until == span[0] and span[1] - span[0] < 1e-11
+    assert abs(found.t[-1] - 0.5 * sum(span)) < 1e-9
+    assert list(proven.columns["t"]) == [0.005, found.t[-1]]
+
+
 @pytest.mark.slow
 def test_the_end_of_the_stroke_is_enclosed_where_simulate_stops():
     proven, found = (

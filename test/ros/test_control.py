@@ -116,7 +116,7 @@ def clock(time_ns):
     return message
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_a_run_as_fast_as_possible_loses_no_sample(nodes, observer):
     # by this process before the run, which is short
     heard = "[joint_states, /diagnostics]"

@@ -44,7 +44,7 @@ def out(tmp_path_factory, domain_of_module):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 @pytest.mark.parametrize("part", PICTURES)
 def test_a_run_is_recorded_whole_and_its_error_is_at_rounding(out, part):
     summary = json.loads((out / part / "summary.json").read_text())

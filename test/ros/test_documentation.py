@@ -126,7 +126,7 @@ def test_the_policies_allow_what_running_nodes_use_and_no_more(
             assert names <= expected[right], (node.name, right)
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_diagnostics_are_the_docs_and_description_is_optional(nodes, observer):
     # The scene has limits, and so distances to them.
     nodes.run("simulator", scene="example2_heavy", publish_description=False)

@@ -49,7 +49,7 @@ NAMED = [named([math.nan, 0.0, 0.0]), named([0.0] * 2, names=NAMES[:2])]
     ("good", "bad", "because", "said"),
     [
         pytest.param(torques(*GOOD), PLAIN, "wrong size 1, not finite 1",
-                     "must be 3 finite torques", marks=pytest.mark.slow),
+                     "must be 3 finite torques", marks=pytest.mark.breadth),
         (named(GOOD[::-1], names=NAMES[::-1]), NAMED, "not finite 1, wrong names 1",
          "must be gamma_1, gamma_2, gamma_3, each once"),
     ],
@@ -203,7 +203,7 @@ def test_a_flood_of_commands_is_bounded(nodes, observer):
     assert nodes.stop(process)[0] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
     nodes.run("simulator")
     observer.phase("running")
@@ -216,7 +216,7 @@ def test_every_one_of_many_calls_at_once_is_answered(nodes, observer):
     assert all(call.result().success for call in calls)
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_kill_of_a_view_ends_its_simulator(nodes, observer):
     looking = (
         "from sst_ros.view.source import run_simulator\nwith run_simulator('swing'):"
@@ -271,7 +271,8 @@ RECORDER = pytest.param("recorder", marks=needs("rosbags", "mcap"))
 
 
 @pytest.mark.parametrize(
-    "command", slow_after(1, ["simulator", RECORDER, "torque_player"])
+    "command",
+    slow_after(1, ["simulator", RECORDER, "torque_player"], mark=pytest.mark.breadth),
 )
 def test_signals_twice_end_a_node_once(nodes, observer, tmp_path, command):
     is_recorder = command == "recorder"

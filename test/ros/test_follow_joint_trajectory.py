@@ -103,7 +103,9 @@ class Client:
         return [self.tolerance(name=joint, position=position)]
 
 
-@pytest.fixture(scope="module", params=slow_after(1, ["lockstep", "free"]))
+@pytest.fixture(
+    scope="module", params=slow_after(1, ["lockstep", "free"], mark=pytest.mark.breadth)
+)
 def client(types, tmp_path_factory, request):
     """Clients of two runs, each in a domain of its own."""
     with (

@@ -309,7 +309,7 @@ def test_a_stream_of_trajectories_moves_a_run_without_a_jump(nodes, observer, tm
     assert np.abs(off / dt**2).max() < 4.0 and np.ptp(gamma[:, 0]) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_the_recording_survives_a_killed_simulator_which_lets_go(
     nodes, observer, tmp_path
 ):

@@ -123,7 +123,9 @@ class ControllerManager:
             self.publisher.publish(named(torque, state.header.stamp))
 
 
-@pytest.mark.parametrize("rate", slow_except([500], [100, 500]))
+@pytest.mark.parametrize(
+    "rate", slow_except([500], [100, 500], mark=pytest.mark.breadth)
+)
 def test_a_controller_manager_updates_once_for_each_sample(nodes, domain, rate):
     """The same bits whether its controller is there at once or later."""
     count = int(0.2 * rate) + 1
@@ -168,7 +170,9 @@ def test_an_example_runs_by_the_equations_of_the_paper(nodes, observer, name):
         simulation.steps(profile((k + 0.5) * PERIOD_NS / 1e9), PERIOD_NS // 2, 2)
 
 
-@pytest.mark.parametrize("sync", slow_except(["free"], ["free", "lockstep"]))
+@pytest.mark.parametrize(
+    "sync", slow_except(["free"], ["free", "lockstep"], mark=pytest.mark.breadth)
+)
 def test_the_example_of_a_controller_reaches_its_goal(nodes, observer, sync):
     nodes.start("", executable=[sys.executable, str(EXAMPLE)])
     nodes.run("simulator", scene="example2", sync=sync, wait_for_command=True)

@@ -38,7 +38,7 @@ def measured(nodes, observer, *, sync="lockstep", seconds=1.0, **given):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_noise_is_that_of_the_parameters_and_repeats_by_seed(nodes, observer):
     noise = {"angle_noise": 1e-3, "rate_noise": 0.1, "measurement_seed": 7}
     (stamps, seen), (true_stamps, true) = measured(nodes, observer, **noise)

@@ -105,7 +105,12 @@ def give(worker, message):
 
 
 @pytest.mark.parametrize(
-    "kind", slow_except([TorquePlayer], [TorquePlayer, InverseDynamicsController])
+    "kind",
+    slow_except(
+        [TorquePlayer],
+        [TorquePlayer, InverseDynamicsController],
+        mark=pytest.mark.breadth,
+    ),
 )
 def test_a_fault_ends_who_commands_in_every_order_of_messages(make, kind):
     for messages in orders(PHASES, STATES):
@@ -129,7 +134,12 @@ def test_a_fault_is_no_concern_of_who_has_not_commanded(make, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", slow_except([TorquePlayer], [TorquePlayer, InverseDynamicsController])
+    "kind",
+    slow_except(
+        [TorquePlayer],
+        [TorquePlayer, InverseDynamicsController],
+        mark=pytest.mark.breadth,
+    ),
 )
 def test_the_end_of_the_run_ends_who_commands_in_every_order(make, kind):
     """Answers that are still to be given are given first: the node looks later."""

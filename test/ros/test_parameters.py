@@ -90,7 +90,7 @@ def machine_latency_us():
         return None
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_exit_latency_is_limited_while_a_run_has_deadlines(nodes, observer):
     before = machine_latency_us()
     if not before:
@@ -281,12 +281,15 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("broken", slow_except(["types without support"], BROKEN))
+@pytest.mark.parametrize(
+    "broken", slow_except(["types without support"], BROKEN, mark=pytest.mark.breadth)
+)
 @pytest.mark.parametrize(
     ("package", "node"),
     slow_after(
         1,
         [("simulation_interfaces", "simulator"), ("control_msgs", "inverse_dynamics")],
+        mark=pytest.mark.breadth,
     ),
 )
 def test_an_incomplete_package_of_messages_is_left_out(

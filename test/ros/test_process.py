@@ -164,7 +164,7 @@ def test_each_generation_finds_its_own_file(
     assert element in Path(given[1]).read_text(encoding="utf-8")
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_garbage_of_the_start_is_not_looked_through_again(domain):
     enabled, objects = python(QUIET).stdout.split()[:2]
     assert enabled == "False"

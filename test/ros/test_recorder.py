@@ -20,7 +20,6 @@ from mcap.writer import MCAP0_MAGIC
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros.conftest import COMMANDS, NODE
 from sensor_msgs.msg import JointState
-from slow_cases import slow_after
 from std_msgs.msg import Float64MultiArray, String
 
 from sst_ros.errors import InputError
@@ -64,7 +63,11 @@ def whole(bag, more_than):
 
 @pytest.mark.parametrize(
     "number",
-    slow_after(1, [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]),
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.breadth),
+    ],
 )
 def test_signals_leave_a_readable_bag_with_all_samples(
     nodes, observer, tmp_path, number
@@ -110,7 +113,7 @@ def test_commands_are_read_once_all_of_a_simulators_topics_are(
     assert nodes.line(recorder) == "ready: 8 topics\n"
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_a_latched_topic_is_heard_if_its_subscriber_comes_first(
     nodes, observer, domain, tmp_path
 ):
@@ -179,7 +182,7 @@ def test_lost_messages_are_counted(nodes, observer, tmp_path):
     assert re.search(r"lost messages: \d+ of /joint_states", err), err
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_another_robots_joint_states_do_not_stand_for_ours(nodes, observer, tmp_path):
     """They are recorded, as the topic is, but the recorder is not ready with them
     alone.
@@ -246,7 +249,7 @@ def test_rosbag2_is_given_the_declared_qos():
         assert profile["reliability"] == "reliable"
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path):
     states = observer.states  # from the beginning of the run
     recorder = nodes.run("recorder", output=tmp_path / "bag")
@@ -275,7 +278,7 @@ def test_kill_of_the_simulator_leaves_a_whole_bag(nodes, observer, tmp_path):
     assert whole(tmp_path / "bag", 300).diagnostics["phase"] == "running"
 
 
-@pytest.mark.slow
+@pytest.mark.breadth
 def test_a_full_disk_ends_the_recorder_in_words(nodes, observer, tmp_path):
     recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (700_000, 700_000))

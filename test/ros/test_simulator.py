@@ -77,7 +77,9 @@ def test_the_other_topics_belong_to_the_same_instants(nodes, observer):
     assert stamps(messages) == [start + k * 50_000_000 for k in range(3)]
 
 
-@pytest.mark.parametrize("number", slow_after(1, [signal.SIGINT, signal.SIGTERM]))
+@pytest.mark.parametrize(
+    "number", slow_after(1, [signal.SIGINT, signal.SIGTERM], mark=pytest.mark.breadth)
+)
 def test_signals_end_it_and_others_see_at_once_that_it_has_left(
     nodes, observer, number
 ):
