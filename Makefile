@@ -111,7 +111,7 @@ $(VENV)/.docs: $(VENV)/.python setup.py
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.python setup.py
-	$(INSTALL) --editable ".[$(EXTRAS),view,engines,cluster,test]"
+	$(INSTALL) --editable ".[$(EXTRAS),view,engines,cluster,test,coverage]"
 	@touch $@
 
 clean:  ## remove environments and results

@@ -68,6 +68,8 @@ EXTRAS |= {
     ],
     "engines": ["mujoco>=4", "pin>=4"],
     "peers": ["casadi>=3.6.5", "cmeel-eigen", "mpmath", "mujoco>=4", "pin>=4"],
+    # Not in `test`: colcon would measure coverage, in ten times the time.
+    "coverage": ["pytest-cov"],
     "test": [
         "argcomplete",
         "build",
@@ -84,7 +86,6 @@ EXTRAS |= {
         "mpmath",
         "mypy",
         "pytest",
-        "pytest-cov",
         "pytest-timeout",
         "pytest-xdist",
         "python-flint>=0.8",

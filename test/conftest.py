@@ -8,7 +8,6 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import itertools
-from pathlib import Path
 
 import hypothesis
 import pytest
@@ -21,36 +20,13 @@ from sst_ros.scene import scene
 hypothesis.settings.register_profile("untimed", deadline=None)
 hypothesis.settings.load_profile("untimed")
 
-pytest_plugins = ["pytester", "missing_packages", "unexpected_skips", "repeat_failures"]
-
-
-OF_THE_REPOSITORY = (
-    *("benchmark", "campaign", "docs", "examples", "proof", "studies"),
-    *(
-        "test_gallery.py",
-        "test_house.py",
-        "test_release.py",
-        "test_unexpected_skips.py",
-    ),
-)
-"""Tests of pages, tools, studies and structure, and proofs, whose library has no key.
-
-They say nothing about the platform on which a package is built: `colcon test` leaves
-them out, `make test` runs them.
-"""
-
-
-def pytest_configure(config):
-    """Choose what colcon runs, which chooses nothing: no slow tests, none of the
-    repository.
-    """
-    if config.option.markexpr or any("::" in word for word in config.args):
-        return
-    config.option.markexpr = "not slow"
-    source = getattr(config, "args_source", None)  # since pytest 7.2
-    if source is not None and source.name != "ARGS":
-        left_out = [str(Path(__file__).parent / name) for name in OF_THE_REPOSITORY]
-        config.option.ignore = [*(config.option.ignore or []), *left_out]
+pytest_plugins = [
+    "pytester",
+    "colcon_choice",
+    "missing_packages",
+    "unexpected_skips",
+    "repeat_failures",
+]
 
 
 def pytest_pycollect_makemodule(module_path, parent):

@@ -6,6 +6,7 @@ Exceptions with their reasons.
 `make lint` checks the same and more with ruff, on any machine.
 """
 
+import configparser
 import os
 import socket
 from pathlib import Path
@@ -15,6 +16,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("sst_ros", "launch", "tools")
 PYTHON = (*FOLDERS, "test", "benchmark", "examples")
+LONG_EQUATIONS = ("test_paper_equations.py",)
+"""Files that setup.cfg excepts from E501."""
 PEP257_EXCEPTIONS = (
     "D213",  # the summary is on the first line of the docstring (D212)
     "D401",  # also asked of properties, which are nouns; ruff asks it of functions only
@@ -65,6 +68,17 @@ def test_copyright():
         ROOT / "LICENSE"
     )
     assert (found.exists, found.license_identifier) == (True, "apache2")
+
+
+def test_no_line_is_longer_than_flake8_allows():
+    """Ruff passes some lines that are: those of one word, and those with `noqa`."""
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    longest = int(config["flake8"]["max-line-length"])
+    for path in (path for name in PYTHON for path in (ROOT / name).rglob("*.py")):
+        if path.name not in LONG_EQUATIONS:
+            lines = path.read_text("utf-8").splitlines()
+            assert max(map(len, lines), default=0) <= longest, path
 
 
 @pytest.mark.parametrize("folder", PYTHON)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from colcon_choice import ON_A_PLATFORM
 
 import sst_ros
 from sst_ros.cli.commands import NODE_HELP
@@ -114,6 +115,19 @@ def test_every_node_has_an_executable_for_ros2_run():
     assert all(os.access(ROOT / "executables" / name, os.X_OK) for name in NODE_HELP)
 
 
+def test_colcon_runs_files_that_exist():
+    """A name that is wrong would end `colcon test` before its first test."""
+    missing = [name for name in ON_A_PLATFORM if not (ROOT / "test" / name).exists()]
+    assert not missing
+    assert len(ON_A_PLATFORM) == len(set(ON_A_PLATFORM))
+
+
+def test_colcon_measures_no_coverage(setup_arguments):
+    """It does where the extra `test` names pytest-cov, which ROS's tools bring."""
+    extras = setup_arguments["extras_require"]
+    assert not [word for word in extras["test"] if word.startswith("pytest-cov")]
+
+
 @pytest.fixture(scope="module")
 def depends():
     root = ET.parse(ROOT / "package.xml").getroot()
@@ -121,14 +135,21 @@ def depends():
 
 
 @pytest.fixture(scope="module")
-def required():
-    """Names of Python packages that setup.py asks for, without the wheels of ROS."""
+def setup_arguments():
+    """What setup.py gives to setuptools."""
     given = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         patch.setattr("setuptools.setup", given.update)
         runpy.run_path("setup.py")
-    words = [*given["install_requires"], *given["extras_require"]["all"]]
+    return given
+
+
+@pytest.fixture(scope="module")
+def required(setup_arguments):
+    """Names of Python packages that setup.py asks for, without the wheels of ROS."""
+    extras = setup_arguments["extras_require"]
+    words = [*setup_arguments["install_requires"], *extras["all"]]
     names = {re.match(r"[\w-]+", word)[0] for word in words}
     return {name for name in names if not name.startswith("ros-")}
 

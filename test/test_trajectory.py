@@ -158,6 +158,7 @@ def test_what_is_no_trajectory_is_refused(run, tmp_path):
             Trajectory.load(tmp_path / name)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("flips", slow_after(1, [120, 600]))
 def test_a_flipped_bit_is_refused_or_changes_nothing(run, path, flips):
     generator, refused = random.Random(1), 0

@@ -72,7 +72,10 @@ def sst_ros(
         ledger.add_finding("tracebacks", f"{name}: ended by signal {-status}")
 
 
-VERBS = "compile demo describe export plan plot report recover scene study view".split()  # noqa: SIM905
+VERBS = (
+    *("compile", "demo", "describe", "export", "plan", "plot", "report", "recover"),
+    *("scene", "study", "view"),
+)
 
 WRONG = [
     line.split()

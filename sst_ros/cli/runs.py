@@ -182,13 +182,13 @@ def certify_scene(options: argparse.Namespace) -> int:
     for path in (options.out, options.tracking):
         if path is not None:
             require_free(path, "certify", force=options.force)
-    choices = {name: getattr(options, name) for name in ("duration", "bound")}
-    ranges: dict[str, object] = dict.fromkeys(options.digits, "digits")
-    for text in options.range:
-        key, width = read_range(text)
-        refuse_unless("certify", ("--range", text, key not in ranges, "names it twice"))
-        ranges[key] = width
-    choices |= {"ranges": ranges, "split": options.split or 1, "progress": True}
+    choices: dict[str, Any] = {
+        "duration": options.duration,
+        "bound": options.bound,
+        "ranges": _certified_ranges(options),
+        "split": options.split or 1,
+        "progress": True,
+    }
     scene = load(options.scene)
     torque = None
     if options.control is not None:
@@ -217,6 +217,16 @@ def certify_scene(options: argparse.Namespace) -> int:
         table = require("pandas").DataFrame(proven.tracking)
         _write_in_full(table, options.tracking)
     return 0 if proven.success else 1
+
+
+def _certified_ranges(options: argparse.Namespace) -> dict[str, object]:
+    """Return the numbers that are not exact, by key, of --digits and --range."""
+    ranges: dict[str, object] = dict.fromkeys(options.digits, "digits")
+    for text in options.range:
+        key, width = read_range(text)
+        refuse_unless("certify", ("--range", text, key not in ranges, "names it twice"))
+        ranges[key] = width
+    return ranges
 
 
 def prove_zone(options: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ import tempfile
 import uuid
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -106,11 +106,16 @@ def fmu_file(equations: SceneEquations) -> dict[str, bytes]:
     files["sources/buildDescription.xml"] = build
     files |= {f"sources/{file}": text for file, text in sources.items()}
     files |= _binary(name, sources)
+    return {f"{name}.fmu": _pack(files)}
+
+
+def _pack(files: Mapping[str, str | bytes]) -> bytes:
+    """Return files by path as a zip file; equal files give equal bytes."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as unit:
         for path, content in files.items():
             unit.writestr(zipfile.ZipInfo(path, EPOCH), content, zipfile.ZIP_DEFLATED)
-    return {f"{name}.fmu": packed.getvalue()}
+    return packed.getvalue()
 
 
 def _variables(equations: SceneEquations) -> Iterator[dict[str, Any]]:

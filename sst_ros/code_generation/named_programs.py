@@ -255,18 +255,6 @@ def _energies(equations: SceneEquations) -> NamedProgram:
     return NamedProgram("energies", description, arguments, (2,), program)
 
 
-def _by_state(equations: SceneEquations) -> NamedProgram:
-    return _jacobian(equations, equations.state)
-
-
-def _by_torque(equations: SceneEquations) -> NamedProgram:
-    return _jacobian(equations, equations.acting[0])
-
-
-def _by_parameters(equations: SceneEquations) -> NamedProgram:
-    return _jacobian(equations, equations.open[0])
-
-
 def _jacobian(equations: SceneEquations, by: Argument) -> NamedProgram:
     """Trace the Jacobian of the derivative by an argument.
 
@@ -292,9 +280,9 @@ PROGRAM_OUTPUTS: dict[str, Callable[[SceneEquations], NamedProgram]] = {
     "derivative": _derivative,
     "joints": _joints,
     "energies": _energies,
-    "derivative_by_state": _by_state,
-    "derivative_by_torque": _by_torque,
-    BY_PARAMETERS: _by_parameters,
+    "derivative_by_state": lambda equations: _jacobian(equations, equations.state),
+    "derivative_by_torque": lambda equations: _jacobian(equations, equations.acting[0]),
+    BY_PARAMETERS: lambda equations: _jacobian(equations, equations.open[0]),
 }
 """What traces each of the equations."""
 

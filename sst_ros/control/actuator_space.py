@@ -13,10 +13,10 @@ from __future__ import annotations
 import contextlib
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,22 +30,38 @@ from sst_ros.errors import (
 )
 from sst_ros.mechanism import continuation
 from sst_ros.mechanism import generic_math as gm
-from sst_ros.mechanism.generic_math import axpy, cross3, dot3, multiply
+from sst_ros.mechanism.generic_math import (
+    Triple,
+    axpy,
+    cross3,
+    dot3,
+    multiply,
+    triple,
+)
 from sst_ros.mechanism.geometry import Array, Geometry, quaternion_of, rotation_matrix
-from sst_ros.programs.expression import compile_program, trace
+from sst_ros.programs.expression import compile_program, divide, trace
 from sst_ros.state import ZERO, Explained, Quaternion, Vector3, find_lost_meaning
 
 # residual abs(r_k . t_k) at which Newton's method ends: rounding
 ANGLE_ROUNDING = 4e-16
 # largest loop-closure residual abs(r_k . t_k) of an orientation that is returned
 CLOSED = 1e-14
+# most steps of Newton's method to an orientation: from close by four or five do
 _INVERSION_STEPS = 20
-_STAR_MOTION = (*"xyzw", "wx", "wy", "wz", "ax", "ay", "az")
-_MOVING = (*_STAR_MOTION[:4], "d1", "d2", "d3", "dd1", "dd2", "dd3")
-_POSE_NUMBERS = (
-    *_STAR_MOTION[:4],
-    *(f"r{k}{axis}" for k in range(3) for axis in "xyz"),
-)
+# residual in rad at which the orientations of arrays are done: Newton's method is
+# quadratic, and the next step would be rounding
+_ARRAY_RESIDUAL = 1e-9
+
+# Inputs of the traced functions.
+_STAR_SIZES = {"quaternion": 4, "rate": 3, "acceleration": 3}
+_ACTUATOR_SIZES = {"quaternion": 4, "gamma_dot": 3, "gamma_ddot": 3}
+_POSE_SIZES = {"quaternion": 4, "carriages": 9}
+_CARRIAGE_SIZES = {"r_1": 3, "r_2": 3, "r_3": 3}
+
+
+def name_parts(sizes: Mapping[str, int]) -> list[str]:
+    """Return names of the numbers of some parts, as inputs of a traced function."""
+    return [f"{name}_{k}" for name, size in sizes.items() for k in range(size)]
 
 
 @dataclass(frozen=True)
@@ -87,10 +103,9 @@ class ReferenceMotion(Explained):
         pieces: tuple[float, ...],
         effort: Callable[[float], Vector3] | None = None,
     ) -> None:
-        some = isinstance(pieces, tuple) and len(pieces) > 0
-        refuse_unless(
-            "motion", ("pieces", pieces, some, "must be rising times [s], a tuple")
-        )
+        is_tuple = isinstance(pieces, tuple) and len(pieces) > 0
+        requirement = "must be rising times [s], a tuple"
+        refuse_unless("motion", ("pieces", pieces, is_tuple, requirement))
         self._inside = inside
         self.pieces = pieces
         self.duration = pieces[-1]
@@ -102,7 +117,9 @@ class ReferenceMotion(Explained):
 
         Raises SingularConfiguration in a singularity.
         """
-        lost = "" if type(time) is float else find_lost_meaning(time)
+        lost = ""
+        if type(time) is not float:
+            lost = find_lost_meaning(time)
         if lost or math.isnan(time):
             refuse_unless("motion", ("time", time, False, "must be a number [s]"))
         inside = min(max(time, 0.0), self.duration)
@@ -181,18 +198,18 @@ def _slowed_down(
     """
     u = time / duration
     reference = motion.at(_slowed_time(begin, duration, time))
-    speed = 1.0 - u * u * (3.0 - 2.0 * u)
-    change = -6.0 * u * (1.0 - u) / duration
+    speed = 1.0 - u * u * (3.0 - 2.0 * u)  # ds/dt
+    change = -6.0 * u * (1.0 - u) / duration  # d^2s/dt^2
+
+    def accelerate(acceleration: Vector3, rate: Vector3) -> Vector3:
+        return axpy(speed * speed, acceleration, change, rate)
+
     return replace(
         reference,
         body_rate=multiply(speed, reference.body_rate),
-        body_acceleration=axpy(
-            speed * speed, reference.body_acceleration, change, reference.body_rate
-        ),
+        body_acceleration=accelerate(reference.body_acceleration, reference.body_rate),
         gamma_dot=multiply(speed, reference.gamma_dot),
-        gamma_ddot=axpy(
-            speed * speed, reference.gamma_ddot, change, reference.gamma_dot
-        ),
+        gamma_ddot=accelerate(reference.gamma_ddot, reference.gamma_dot),
     )
 
 
@@ -203,21 +220,28 @@ class ActuatorSpaceMap:
     in a serial one (sin(mu_k) = 0), newton_step in a parallel one (det J2 = 0), the
     others in both. Of arrays they give numbers that are not finite there, and a warning
     of NumPy.
+
+    Attributes:
+        geometry: that of the mechanism.
+        star_motion: `star_accelerations`, compiled for numbers.
+        posture: `postures`, compiled for numbers.
+
     """
 
     def __init__(self, geometry: Geometry) -> None:
         self.geometry = geometry
-        rows = zip(
-            geometry.w.tolist(), geometry.v.tolist(), geometry.e.tolist(), strict=True
-        )
-        legs = (
-            kernel.Leg(tuple(w), tuple(v), cross3(w, v), e[0], e[1]) for w, v, e in rows
-        )
+        legs = []
+        for k in range(3):
+            w = triple(geometry.w[k].tolist())
+            v = triple(geometry.v[k].tolist())
+            e0, e1, _ = geometry.e[k].tolist()
+            legs.append(kernel.Leg(w, v, cross3(w, v), e0, e1))
         self._legs = tuple(legs)
-        # star_motion: W and W_dot in {E}, six numbers, of a quaternion, gamma_dot and
-        # gamma_ddot. posture: sin(mu) and beta [rad] of the legs, six numbers, and det
-        # J2, of a quaternion.
-        self._actuators, self.star_motion, self.posture, self._newton = _compile(self)
+        compiled = _compile(self)
+        self.star_motion = compiled.star_motion
+        self.posture = compiled.posture
+        self._actuator_motion = compiled.actuator_motion
+        self._newton = compiled.newton_step
 
     def __eq__(self, other: object) -> bool:
         """Compare legs, from which all programs follow."""
@@ -233,11 +257,15 @@ class ActuatorSpaceMap:
 
     def of_star(self, q: Quaternion, rate: Vector3, acceleration: Vector3) -> Reference:
         """Return the reference of a state of the star; gamma is in (-pi, pi] [rad]."""
-        g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = self._actuators(
-            *q, *rate, *acceleration
-        )
+        numbers = self._actuator_motion(*q, *rate, *acceleration)
+        g1, g2, g3, d1, d2, d3, dd1, dd2, dd3 = numbers
         return Reference(
-            q, rate, acceleration, (g1, g2, g3), (d1, d2, d3), (dd1, dd2, dd3)
+            quaternion=q,
+            body_rate=rate,
+            body_acceleration=acceleration,
+            gamma=(g1, g2, g3),
+            gamma_dot=(d1, d2, d3),
+            gamma_ddot=(dd1, dd2, dd3),
         )
 
     def follow(
@@ -250,16 +278,19 @@ class ActuatorSpaceMap:
         """Find the quaternion at gamma of the assembly mode known at other angles.
 
         The other angles may be far from gamma. The quaternion is found in the steps
-        that `continuation` proves to stay in the mode. The proof needs sigma, the least
-        singular value of J2. The rows of J2 are unit vectors, so its squared singular
-        values sum to 3, the product of the larger two is at most 3/2, and sigma >= 2/3
-        abs(det J2): enough for most steps, and cheap. Raises BranchEnds where a
+        that `continuation` proves to stay in the mode. Raises BranchEnds where a
         parallel singularity lies between, or no assembly has these angles.
+
+        The proof needs `sigma`, a bound below the least singular value of J2. The rows
+        of J2 are unit vectors, so its squared singular values sum to 3, the product of
+        the larger two is at most 3/2, and sigma >= 2/3 abs(det J2): enough for most
+        steps, and cheap.
         """
         step = math.dist(gamma, start_gamma)
         with contextlib.suppress(ArithmeticError):
             if sigma is None:
-                sigma = 2.0 / 3.0 * abs(self.posture(*start_quaternion)[-1])
+                *_, det_j2 = self.posture(*start_quaternion)
+                sigma = 2.0 / 3.0 * abs(det_j2)
             if step <= continuation.SAFE_STEP * sigma * sigma:
                 quaternion = self._find_orientation(start_quaternion, gamma)
                 # The theorem holds in a ball about R, see `continuation.advance`. A
@@ -297,10 +328,9 @@ class ActuatorSpaceMap:
         """
         components: list[Any] = []
         for angle, leg in zip(gamma, self._legs, strict=True):
-            c, s = gm.cos(angle), gm.sin(angle)
-            components += [
-                c * x + s * y for x, y in zip(leg.v, leg.across, strict=True)
-            ]
+            cosine, sine = gm.cos(angle), gm.sin(angle)
+            for x, y in zip(leg.v, leg.across, strict=True):
+                components.append(cosine * x + sine * y)
         return components
 
     def orientations(
@@ -308,107 +338,123 @@ class ActuatorSpaceMap:
     ) -> Array:
         """Find quaternions (n, 4) at gamma (n, 3) by steps of Newton's method.
 
-        The steps begin at `guesses`, shape (n, 4).
+        The steps begin at `guesses`, shape (n, 4). Nothing says whether they arrive.
         """
         carriages = self.carriages(gamma.T)
         q = list(guesses.T)
         for _ in range(steps):
-            *q, first, second, third = self.newton_step(*q, *carriages)
-            if np.abs((first, second, third)).max(initial=0.0) < 1e-9:
-                break  # quadratic: the next step would be rounding
+            x, y, z, w, *residuals = self.newton_step(*q, *carriages)
+            q = [x, y, z, w]
+            if np.abs(residuals).max(initial=0.0) < _ARRAY_RESIDUAL:
+                break
         return np.stack(q, axis=1)
 
-    def _of_star(self, *inputs: Any) -> tuple[Any, ...]:
-        rows = gm.rotation_rows(inputs[:4])
-        rate = inputs[4:7]
-        acceleration = inputs[7:10]
-        legs = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
-        return (
-            *(kernel.joint_angle(moving_leg, 0) for moving_leg in legs),
-            *(moving_leg.gamma_dot for moving_leg in legs),
-            *(
-                dot3(moving_leg.g, acceleration)
-                + kernel.rest_accelerations(moving_leg, rate)[1]
-                for moving_leg in legs
-            ),
-        )
+    def _accelerate_actuators(self, *inputs: Any) -> tuple[Any, ...]:
+        """Return gamma, gamma_dot and gamma_ddot of quaternion, W and W_dot."""
+        of = divide(_STAR_SIZES, inputs)
+        rows = gm.rotation_rows(of["quaternion"])
+        legs = [kernel.leg_motion(leg, rows, of["rate"]) for leg in self._legs]
+        gamma = [kernel.joint_angle(leg, 0) for leg in legs]
+        gamma_dot = [leg.gamma_dot for leg in legs]
+        gamma_ddot = []
+        for leg in legs:
+            _, at_rest = kernel.rest_accelerations(leg, of["rate"])
+            gamma_ddot.append(dot3(leg.g, of["acceleration"]) + at_rest)
+        return (*gamma, *gamma_dot, *gamma_ddot)
 
-    def postures(self, *q: Any) -> tuple[Any, ...]:
-        """See `posture`; of a quaternion of numbers of any kind."""
-        rows = gm.rotation_rows((q[0], q[1], q[2], q[3]))
+    def postures(self, x: Any, y: Any, z: Any, w: Any) -> tuple[Any, ...]:
+        """Return sin(mu) and beta [rad] of the legs, and det J2, seven numbers.
+
+        They are those of a quaternion, of numbers of any kind.
+        """
+        rows = gm.rotation_rows((x, y, z, w))
         legs = [kernel.leg_motion(leg, rows, ZERO) for leg in self._legs]
-        sines = [gm.sqrt(posed_leg.u) for posed_leg in legs]
-        # Rows t_k x r_k of J2; p = r sin(mu).
-        j2 = [
-            multiply(1.0 / s, cross3(posed_leg.along, posed_leg.p))
-            for s, posed_leg in zip(sines, legs, strict=True)
-        ]
-        beta = (kernel.joint_angle(posed_leg, 2) for posed_leg in legs)
-        return (*sines, *beta, dot3(j2[0], cross3(j2[1], j2[2])))
+        sines = []
+        j2 = []
+        for leg in legs:
+            sine = gm.sqrt(leg.u)
+            sines.append(sine)
+            # Rows t_k x r_k of J2; p = r sin(mu).
+            j2.append(multiply(1.0 / sine, cross3(leg.along, leg.p)))
+        beta = [kernel.joint_angle(leg, 2) for leg in legs]
+        first, second, third = j2
+        return (*sines, *beta, dot3(first, cross3(second, third)))
 
     def star_accelerations(self, *inputs: Any) -> tuple[Any, ...]:
-        """W [rad/s] and W_dot of quaternion, gamma_dot and gamma_ddot.
+        """Return W [rad/s] and W_dot [rad/s^2] in {E}, six numbers.
 
-        Numbers of any kind.
+        They are those of a quaternion, gamma_dot and gamma_ddot, of numbers of any
+        kind.
         """
-        rows = gm.rotation_rows(inputs[:4])
-        gamma_dot = inputs[4:7]
-        gamma_ddot = inputs[7:10]
-        reach = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
-        rate = _solve(reach, gamma_dot)
-        moving = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
-        rest_accelerations = [
-            kernel.rest_accelerations(moving_leg, rate)[1] for moving_leg in moving
-        ]
-        missing = [
-            total - rest_acceleration
-            for total, rest_acceleration in zip(
-                gamma_ddot, rest_accelerations, strict=True
-            )
-        ]
-        return (*rate, *_solve(reach, missing))
+        of = divide(_ACTUATOR_SIZES, inputs)
+        rows = gm.rotation_rows(of["quaternion"])
+        g = [kernel.leg_motion(leg, rows, ZERO).g for leg in self._legs]
+        rate = _solve(g, of["gamma_dot"])
+        legs = [kernel.leg_motion(leg, rows, rate) for leg in self._legs]
+        missing = []  # what W_dot adds to gamma_ddot
+        for leg, gamma_ddot in zip(legs, of["gamma_ddot"], strict=True):
+            _, at_rest = kernel.rest_accelerations(leg, rate)
+            missing.append(gamma_ddot - at_rest)
+        return (*rate, *_solve(g, missing))
 
     def newton_step(self, *inputs: Any) -> tuple[Any, ...]:
         """Take a step of Newton's method for r_k . R e_k = 0.
 
-        Return the quaternion after it, and the three residuals before it.
+        Of a quaternion and `carriages`, return the quaternion after it, and the three
+        residuals before it.
         """
-        rows = gm.rotation_rows(inputs[:4])
-        arcs = [(leg.e0, leg.e1, 0.0) for leg in self._legs]
-        local = [gm.rotate_back(rows, inputs[4 + 3 * k : 7 + 3 * k]) for k in range(3)]
-        residual = [dot3(r, e) for r, e in zip(local, arcs, strict=True)]
-        # R exp(turn): the residual changes by turn . (e x r).
-        slope = [cross3(e, r) for r, e in zip(local, arcs, strict=True)]
-        turn = multiply(-0.5, _solve(slope, residual))
-        moved = gm.quaternion_product(inputs[:4], (*turn, 1.0))
+        of = divide(_POSE_SIZES, inputs)
+        rows = gm.rotation_rows(of["quaternion"])
+        residuals = []
+        slopes = []
+        carriages = divide(_CARRIAGE_SIZES, of["carriages"]).values()
+        for leg, carriage in zip(self._legs, carriages, strict=True):
+            e = (leg.e0, leg.e1, 0.0)
+            r = gm.rotate_back(rows, carriage)
+            residuals.append(dot3(r, e))
+            # R exp(turn): the residual changes by turn . (e x r).
+            slopes.append(cross3(e, r))
+        turn = multiply(-0.5, _solve(slopes, residuals))
+        moved = gm.quaternion_product(of["quaternion"], (*turn, 1.0))
         length = gm.sqrt(sum(component * component for component in moved))
-        return (*(component / length for component in moved), *residual)
+        return (*(component / length for component in moved), *residuals)
+
+
+class _Compiled(NamedTuple):
+    """Functions of a map, compiled for numbers."""
+
+    actuator_motion: Callable[..., Any]
+    star_motion: Callable[..., Any]
+    posture: Callable[..., Any]
+    newton_step: Callable[..., Any]
 
 
 @lru_cache(maxsize=16)
-def _compile(space: ActuatorSpaceMap) -> tuple[Callable[..., Any], ...]:
-    """Compile the programs of a map once for all that are equal: that takes 20 ms."""
-    return (
-        compile_program(trace(space._of_star, _STAR_MOTION)),
-        compile_program(trace(space.star_accelerations, _MOVING)),
-        compile_program(trace(space.postures, _STAR_MOTION[:4])),
-        compile_program(trace(space.newton_step, _POSE_NUMBERS)),
+def _compile(space: ActuatorSpaceMap) -> _Compiled:
+    """Compile the functions of a map once for all that are equal: that takes 20 ms."""
+
+    def compile_function(
+        function: Callable[..., Any], sizes: Mapping[str, int]
+    ) -> Callable[..., Any]:
+        return compile_program(trace(function, name_parts(sizes)))
+
+    return _Compiled(
+        compile_function(space._accelerate_actuators, _STAR_SIZES),
+        compile_function(space.star_accelerations, _ACTUATOR_SIZES),
+        compile_function(space.postures, {"quaternion": 4}),
+        compile_function(space.newton_step, _POSE_SIZES),
     )
 
 
-def _solve(rows: list[Any], right: Any) -> Any:
+def _solve(rows: Sequence[Any], right: Sequence[Any]) -> Triple:
     """Solve rows . x = right by Cramer's rule."""
-    normals = (
-        cross3(rows[1], rows[2]),
-        cross3(rows[2], rows[0]),
-        cross3(rows[0], rows[1]),
-    )
-    determinant = dot3(rows[0], normals[0])
-    numerators = [
-        sum(map(operator.mul, right, components))
-        for components in zip(*normals, strict=True)
-    ]
-    return tuple(numerator / determinant for numerator in numerators)
+    first, second, third = rows
+    normals = (cross3(second, third), cross3(third, first), cross3(first, second))
+    determinant = dot3(first, normals[0])
+    numerators = []
+    for components in zip(*normals, strict=True):
+        numerators.append(sum(map(operator.mul, right, components)))
+    return triple(numerator / determinant for numerator in numerators)
 
 
 def follow_assembly(
@@ -422,6 +468,7 @@ def follow_assembly(
         geometry, rotation_matrix(start), start_gamma, end_gamma
     )
     quaternion = quaternion_of(rotation)
-    # the sign of the start
-    x, y, z, w = (quaternion if quaternion @ start >= 0.0 else -quaternion).tolist()
+    if quaternion @ start < 0.0:  # of the two signs, that of the start
+        quaternion = -quaternion
+    x, y, z, w = quaternion.tolist()
     return (x, y, z, w)

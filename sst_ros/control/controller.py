@@ -11,14 +11,19 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias, overload
+from typing import Any, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.control import law
 from sst_ros.control.actuator_space import ActuatorSpaceMap, Reference, ReferenceMotion
-from sst_ros.control.law import Command, ControlChannel, ControllerSettings
+from sst_ros.control.law import (
+    Command,
+    ControlChannel,
+    ControllerSettings,
+    Measurement,
+)
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import (
@@ -45,7 +50,7 @@ from sst_ros.state import (
 
 # sin(mu_k) and det J2 below which rounding leaves a torque less than six digits
 SINGULAR_MASS = 1e-10
-
+_SHORTEST_QUATERNION = 1e-100  # its square is far from the smallest double
 
 Pose: TypeAlias = "State | Sequence[float]"
 """A state, or angles gamma [rad], or a quaternion of {E} in {B}."""
@@ -87,15 +92,11 @@ class InverseDynamics(Explained):
         it. Raises SingularConfiguration, serial (sin(mu_k) = 0) or parallel (det J2 =
         0), where no torques control the star; InputError for numbers that are no state.
         """
-        arguments = (
-            quaternion,
-            body_rate,
-            body_acceleration,
-            moment if self._has_moment_topic else (),
-        )
-        numbers: Any = arguments  # what is refused where they cannot be unpacked
+        moment_numbers = moment if self._has_moment_topic else ()
+        # What is refused where they cannot be unpacked.
+        numbers: Any = (quaternion, body_rate, body_acceleration, moment_numbers)
         with contextlib.suppress(ArithmeticError, TypeError, ValueError, MemoryError):
-            numbers = *arguments[0], *arguments[1], *arguments[2], *arguments[3]
+            numbers = *quaternion, *body_rate, *body_acceleration, *moment_numbers
             first, second, third, determinant, *squares = self._program(*numbers)
             total = first + second + third + determinant
             if isinstance(total, float):  # it is none of masked or complex numbers
@@ -103,8 +104,9 @@ class InverseDynamics(Explained):
                     squares[0] * squares[1] * squares[2]
                 )
                 # Comparisons with NaN are false: what is not finite is refused, too.
-                sound = math.isfinite(first + second + third) and det_j2 > SINGULAR_MASS
-                if sound and min(squares) > SINGULAR_MASS * SINGULAR_MASS:
+                is_sound = math.isfinite(first + second + third)
+                is_sound = is_sound and det_j2 > SINGULAR_MASS
+                if is_sound and min(squares) > SINGULAR_MASS * SINGULAR_MASS:
                     return first, second, third
         raise self._refusal(quaternion, numbers)
 
@@ -148,19 +150,21 @@ class InverseDynamics(Explained):
         return self._torques_at_rest(quaternions)
 
     def mass_matrix(self, at: Pose | Poses) -> Array:
-        """M of tau = M gamma_ddot + h [kg m^2], rotors included.
+        """M of tau = M gamma_ddot + h [kg m^2], rotors included; symmetric.
 
-        Symmetric, shape (3, 3); of n poses, shape (n, 3, 3), with the bits of pose by
-        pose.
-
-        `at` and what is raised are as in `gravity_torque`.
+        Its shape is (3, 3); of n poses (n, 3, 3), with the bits of pose by pose. `at`
+        and what is raised are as in `gravity_torque`.
         """
         quaternions = self._orientations(at)
         if quaternions is None:
             inertia, reach = self._reduce(self._orientation(at))
         else:
             self._torques_at_rest(quaternions)  # refuses singularities
-            numbers = self._dynamics.reduced_inertia_of_rows(quaternions)
+            # Pose by pose in memory, as one pose is: NumPy 1.26 multiplies matrices of
+            # another layout without BLAS, which rounds otherwise.
+            numbers = np.ascontiguousarray(
+                self._dynamics.reduced_inertia_of_rows(quaternions)
+            )
             inertia, reach = np.split(numbers.reshape(-1, 6, 3), 2, axis=1)
         back = np.linalg.inv(reach)
         mass = np.swapaxes(back, -1, -2) @ inertia @ back
@@ -172,17 +176,14 @@ class InverseDynamics(Explained):
 
         They keep gamma_dot as it is. The moment and what is raised are as in `torque`.
         """
-        three = finite_vector(moment) is not None
-        refuse_unless(
-            "inverse dynamics", ("moment", moment, three, "must be three numbers [N m]")
-        )
-        q, rate = state.quaternion, state.body_rate
+        _check_moment(moment)
+        q = state.quaternion
+        rate = state.body_rate
+        _, reach = self._reduce(q)
         rest_acceleration = kernel.actuator_acceleration(
             self._dynamics.model, (*q, *rate), ZERO
         )
-        acceleration = np.linalg.solve(
-            self._reduce(q)[1], np.negative(rest_acceleration)
-        )
+        acceleration = np.linalg.solve(reach, np.negative(rest_acceleration))
         return self.torque(q, rate, triple(acceleration.tolist()), moment)
 
     @check_kinds
@@ -192,13 +193,10 @@ class InverseDynamics(Explained):
         """Return torques [N m] at the actuators that do the work of a moment.
 
         The moment acts on the star, in {B} [N m]. `at` and what is raised are as in
-        `gravity_torque`. The torques stand for loads that a scene has not, in a
-        function for `simulate`.
+        `gravity_torque`. In a function for `simulate` such torques stand for loads that
+        the scene does not have.
         """
-        three = finite_vector(moment) is not None
-        refuse_unless(
-            "inverse dynamics", ("moment", moment, three, "must be three numbers [N m]")
-        )
+        _check_moment(moment)
         q = self._orientation(at)
         _, reach = self._reduce(q)
         acting = rotation_matrix(q).T @ np.asarray(moment, dtype=float)
@@ -239,11 +237,10 @@ class InverseDynamics(Explained):
 
         Raises as `torque` of the first pose that has none.
         """
-        count = len(quaternions)
         zeros = 6  # W and W_dot
         if self._has_moment_topic:
             zeros = 9
-        at_rest = np.zeros((count, zeros))
+        at_rest = np.zeros((len(quaternions), zeros))
         results = self._dynamics.inverse_of_rows(np.hstack([quaternions, at_rest]))
         torques, determinants, squares = np.split(results, [3, 4], axis=1)
         with np.errstate(all="ignore"):  # what is not finite is refused
@@ -260,21 +257,21 @@ class InverseDynamics(Explained):
 
         Raises as `torque`.
         """
-        self.torque(q, ZERO, ZERO)
-        numbers = np.array(self._dynamics.reduced_inertia(*q)).reshape(6, 3)
-        return numbers[:3], numbers[3:]
+        self.torque(q, ZERO, ZERO)  # refuses singularities
+        inertia, reach = np.array(self._dynamics.reduced_inertia(*q)).reshape(2, 3, 3)
+        return inertia, reach
 
     def _facts(self) -> dict[str, object]:
-        actuators = ("torque limit", "actuator lag")
+        of_actuators = ("torque limit", "actuator lag")
+        included = ["star", *terms(self.scene)]
+        moment = "none is given"
+        if self._has_moment_topic:
+            moment = "given with a state"
         return {
             "scene": self.scene.name,
-            "torques for": [
-                term for term in ("star", *terms(self.scene)) if term not in actuators
-            ],
-            "not for": actuators,
-            "external moment": (
-                "given with a state" if self._has_moment_topic else "none is given"
-            ),
+            "torques for": [term for term in included if term not in of_actuators],
+            "not for": of_actuators,
+            "external moment": moment,
         }
 
     def _refusal(
@@ -288,7 +285,7 @@ class InverseDynamics(Explained):
             # quaternion, W and W_dot, and a moment if it comes from a topic
             sizes = len(numbers), len(quaternion)
             finite = sizes in ((10, 4), (13, 4)) and all(map(math.isfinite, numbers))
-        short = finite and math.hypot(*quaternion) < 1e-100
+        short = finite and math.hypot(*quaternion) < _SHORTEST_QUATERNION
         refuse_unless(
             "inverse dynamics",
             ("state", tuple(numbers), finite, "must be finite numbers"),
@@ -297,34 +294,36 @@ class InverseDynamics(Explained):
         geometry = Geometry.of(self.scene)
         # t_k x w_k is r_k times sin(mu_k); J2 has the rows t_k x r_k.
         t = geometry.e @ rotation_matrix(quaternion).T
-        across = np.cross(t, geometry.w)
-        sines = np.linalg.norm(across, axis=1)
+        scaled_r = np.cross(t, geometry.w)
+        sines = np.linalg.norm(scaled_r, axis=1)
         least = float(sines.min())
         if least <= SINGULAR_MASS:
             return SingularConfiguration("serial singularity, sin(mu)", least)
-        determinant = float(np.linalg.det(np.cross(t, across / sines[:, None])))
+        determinant = float(np.linalg.det(np.cross(t, scaled_r / sines[:, None])))
         cause = "no finite torque gives this acceleration:"
         if abs(determinant) <= 2.0 * SINGULAR_MASS:
             cause = "parallel singularity,"
         return SingularConfiguration(f"{cause} det J2", determinant)
 
 
+def _check_moment(moment: Any) -> None:
+    """Refuse a moment that is not three numbers."""
+    is_vector = finite_vector(moment) is not None
+    refuse_unless(
+        "inverse dynamics",
+        ("moment", moment, is_vector, "must be three numbers [N m]"),
+    )
+
+
 class ControlStopped(SstError):
     """No torque can be computed at a `time` of the motion [s].
 
-    So in every call until a reset.
+    Every call raises it again until a reset.
     """
 
     def __init__(self, reason: str, time: float) -> None:
         self.time = time
         super().__init__(f"control stopped at t = {time:.9f} s: {reason}")
-
-
-class Measurement(NamedTuple):
-    """Angles [rad] and rates [rad/s] of the actuators, as encoders measure them."""
-
-    gamma: Vector3
-    gamma_dot: Vector3
 
 
 class ChannelState:
@@ -335,16 +334,11 @@ class ChannelState:
         self._random = np.random.default_rng(seed)
         self._deviations = np.repeat((channel.angle_noise, channel.rate_noise), 3)
         self._before: Any = None  # angles of the last sample, as encoders count them
-        self._queue: Any = (0.0,) * (
-            3 * channel.delay
-        )  # commands that have not arrived
+        self._queue: Any = ZERO * channel.delay  # commands that have not arrived
         self._first = 1.0  # 0 after the first sample
 
     def measure(self, gamma: Vector3, gamma_dot: Vector3) -> Measurement:
-        """Return what the controller receives at a sample.
-
-        It receives gamma [rad] and gamma_dot [rad/s], as they are measured.
-        """
+        """Return gamma [rad] and gamma_dot [rad/s] as the controller receives them."""
         channel = self._channel
         noise: list[float] = []
         if channel.counts and self._before is None:
@@ -352,14 +346,11 @@ class ChannelState:
             self._before = tuple(map(channel.count, earlier))
         if self._deviations.any():
             noise = (self._random.standard_normal(6) * self._deviations).tolist()
-        *measured, self._before = channel.measure(gamma, gamma_dot, self._before, noise)
-        return Measurement(*measured)
+        measured, self._before = channel.measure(gamma, gamma_dot, self._before, noise)
+        return measured
 
     def transmit(self, command: Vector3) -> Vector3:
-        """Return what arrives when this command was sent.
-
-        These are torques [N m] that act, or what is measured.
-        """
+        """Return the torques [N m] that act when a command is sent."""
         torque, self._queue = self._channel.transmit(command, self._queue, self._first)
         self._first = 0.0
         return torque
@@ -437,28 +428,28 @@ class Controller:
         settings = settings or self._settings
         column = np.array(self.inertia)[:, None]
         rate = settings.integral_rate
-        gains = law.feedback_gains(
+        kp_column, kd_column = law.feedback_gains(
             column, lambda name: getattr(settings, name), settings.direct
         )
-        kp, kd = (triple(gain[:, 0].tolist()) for gain in gains)
+        kp = triple(kp_column.ravel().tolist())
+        kd = triple(kd_column.ravel().tolist())
         # Routh: s^3 + kd s^2 + kp s + kp r is stable for 0 < r < kd.
         requirement = (
             f"must be < {min(kd):g} 1/s, damping over inertia: else the loop is"
             " unstable"
         )
-        refuse_unless(
-            "control", ("integral_rate", rate, not rate or rate < min(kd), requirement)
-        )
+        is_stable = not rate or rate < min(kd)
+        refuse_unless("control", ("integral_rate", rate, is_stable, requirement))
         return law.ControlLaw(
-            settings,
-            torque,
-            accelerate,
-            kp,
-            kd,
-            self.inertia,
-            rate,
-            self._limit,
-            self._period_s,
+            settings=settings,
+            torque=torque,
+            accelerate=accelerate,
+            kp=kp,
+            kd=kd,
+            inertia=self.inertia,
+            integral_rate=rate,
+            limit=self._limit,
+            period=self._period_s,
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -472,10 +463,10 @@ class Controller:
 
     @check_kinds
     def tune(self, settings: ControllerSettings) -> None:
-        """Take other gains from the next command on; mode and limit stay.
+        """Take other gains from the next command on.
 
-        The sum of errors stays, too. Raises InputError, and changes nothing, where the
-        integral action would be unstable.
+        Mode, limit and the sum of errors stay. Raises InputError, and changes nothing,
+        where the integral action would be unstable.
         """
         kept = {
             name: getattr(self._settings, name)
@@ -487,7 +478,7 @@ class Controller:
 
     def reset(self) -> None:
         """Clear the integral, the orientation that was observed last, and a failure."""
-        # orientation and gamma from which the next orientation is found
+        # Orientation and gamma from which the next orientation is found.
         self._last_observed = self._begin
         self._integral = ZERO
         self._failure: ControlStopped | None = None
@@ -501,10 +492,10 @@ class Controller:
         self._motion = motion
 
     def desire(self, time: float) -> tuple[Reference, Vector3, Vector3]:
-        """Return the reference at a time [s], its torques, and those held.
+        """Return the reference at a time [s], and its torques [N m].
 
-        The torques [N m] are those of this time, and those that a period holds. They
-        are zeros where the mode does not feed them forward.
+        The torques are those of this time, then those that are held over the period
+        from it on. They are zeros where the mode does not feed them forward.
         """
         desired = self._motion.at(time)
         if not self._settings.feeds:
@@ -512,18 +503,15 @@ class Controller:
         present_torque = self._inverse.reference_torque(desired)
         held_torque = present_torque
         if self._settings.feedforward_at == "middle":
-            held_torque = self._inverse.reference_torque(
-                self._motion.at(self._hold_time(time))
-            )
+            middle = self._motion.at(self._hold_time(time))
+            held_torque = self._inverse.reference_torque(middle)
         return desired, present_torque, held_torque
 
     def _hold_time(self, time: float) -> float:
-        """Return the time of the feedforward held over a period.
-
-        The period is from `time` on [s].
-        """
-        is_middle = self._settings.feedforward_at == "middle"
-        return time + 0.5 * self._period_s if is_middle else time
+        """Return the time of the feedforward that is held from a time on [s]."""
+        if self._settings.feedforward_at == "middle":
+            return time + 0.5 * self._period_s
+        return time
 
     @check_kinds_late
     def command(self, time: float, measured: Measurement) -> Command:
@@ -546,15 +534,13 @@ class Controller:
                 ("measured", numbers, all(map(math.isfinite, numbers)), requirement),
             )
             desired, *torques = self.desire(time)
-            observed: Any = (
-                self._space.follow(*self._last_observed, measured.gamma)
-                if observes
-                else ()
-            )
+            observed: Any = ()
+            if observes:
+                observed = self._space.follow(*self._last_observed, measured.gamma)
             command = self._law.answer(
                 desired,
                 torques,
-                *measured,
+                measured,
                 observed,
                 self._integral,
                 self._motion.effort_at(self._hold_time(time)),
@@ -607,9 +593,14 @@ class TrackingMetrics:
 
     Those of joints have shape (3,).
 
-    Beside the properties: the number of `samples`, the `largest` and the `last` error
-    [rad], `torque_largest` [N m], and `limited`, the samples in which a torque was
-    limited, None where that is not known.
+    Attributes:
+        samples: number of samples.
+        limited: number of samples in which a torque was limited, None where that is not
+            known.
+        largest: largest error of each joint [rad].
+        last: error of each joint at the last sample [rad].
+        torque_largest: largest torque of each joint [N m].
+
     """
 
     def __init__(self, track: Track | None = None, limited: int | None = None) -> None:
@@ -620,13 +611,12 @@ class TrackingMetrics:
         self.last = np.zeros(3)
         self._error_squares = np.zeros(3)  # sums over the samples
         self._torque_squares = np.zeros(3)
-        # of feedforward x torque and of feedback x torque
+        # Sums of feedforward x torque and of feedback x torque.
         self._part_products = np.zeros((2, 3))
         self._lowest = np.full(3, np.inf)  # desired gamma [rad]
         self._highest = np.full(3, -np.inf)
-        self._rested: float | None = None  # when the motion ended
-        # since when the error has been inside the band
-        self._settled: float | None = None
+        self._rested: float | None = None  # when the motion ended [s]
+        self._settled: float | None = None  # since when the error is in the band [s]
         if track is not None:
             self.add(track)
 
@@ -666,10 +656,8 @@ class TrackingMetrics:
     def shares(self) -> Array:
         """Shares of feedforward and feedback in the torque, shape (2, 3).
 
-        Nan without a torque.
-
-        The mean of (part x torque) over the mean of torque^2; what a limit has cut off
-        makes their sum differ from 1.
+        They are the mean of (part x torque) over the mean of torque^2, nan without a
+        torque. What a limit has cut off makes their sum differ from 1.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self._part_products / self._torque_squares)
@@ -691,9 +679,9 @@ class TrackingMetrics:
 
 
 def _since(since: float | None, wrong: NDArray[np.bool_], time: Array) -> float | None:
-    """Return the time since when no sample has been wrong [s].
+    """Return the time since when no sample has been wrong [s]; None if the last is.
 
-    It was `since` before these samples. None where the last one is wrong.
+    It was `since` before these samples.
     """
     if since is not None and not wrong.any():
         return since

@@ -44,8 +44,11 @@ from sst_ros.state import ZERO, Array, Vector3, clamp
 MODES = ("feedforward", "feedforward_pd", "computed_torque", "pd", "gravity_pd")
 SPACES = ("gamma", "so3")
 HELD_INSTANTS = ("start", "middle")
-# added and subtracted, it rounds to whole numbers, halves to even
+# Added and subtracted, it rounds to whole numbers, halves to even: traced numbers have
+# no function that does.
 _ROUND = 1.5 * 2.0**52
+# Added to the square of a sine, it keeps a division by 0 away and changes no other.
+_TINY_SQUARE = 1e-300
 
 
 def _joint_gain(name: str, unit: str, instead: str) -> Any:
@@ -121,6 +124,13 @@ class ControllerSettings(Section):
         return self.mode in ("gravity_pd", "computed_torque")
 
 
+class Measurement(NamedTuple):
+    """Angles [rad] and rates [rad/s] of the actuators, as encoders measure them."""
+
+    gamma: Vector3
+    gamma_dot: Vector3
+
+
 class ControlChannel(Section):
     """What lies between plant and controller; zeros change nothing.
 
@@ -152,12 +162,12 @@ class ControlChannel(Section):
 
     def measure(
         self, gamma: Triple, gamma_dot: Triple, before: Any, noise: Any
-    ) -> tuple[Triple, Triple, Any]:
-        """Return the angles and rates that the controller receives.
+    ) -> tuple[Measurement, Any]:
+        """Return what the controller receives of gamma [rad] and gamma_dot [rad/s].
 
-        Also angles to remember: `before` are those of the last sample, none without
-        encoders; `noise` are six numbers that are added to gamma [rad] and gamma_dot
-        [rad/s], or none.
+        With it come the angles to remember: `before` are those of the last sample, none
+        without encoders. `noise` are six numbers that are added to gamma [rad] and
+        gamma_dot [rad/s], or none.
         """
         if self.counts:
             gamma = triple(map(self.count, gamma))
@@ -165,23 +175,27 @@ class ControlChannel(Section):
             gamma_dot = triple(difference / self.period for difference in moved)
             before = gamma
         if noise:
-            gamma, gamma_dot = add(gamma, noise[:3]), add(gamma_dot, noise[3:])
-        return gamma, gamma_dot, before
+            *angle_noise, first, second, third = noise
+            gamma = add(gamma, triple(angle_noise))
+            gamma_dot = add(gamma_dot, (first, second, third))
+        return Measurement(gamma, gamma_dot), before
 
     def transmit(
         self, command: Triple, queue: Any, first: Scalar
     ) -> tuple[Triple, Any]:
-        """Return the command that acts, and the queue behind it: 3 `delay` numbers.
+        """Return the command that acts, and the queue behind it.
 
-        `first` is 1 at the first sample, else 0.
+        The queue has three numbers for each period of `delay`. `first` is 1 at the
+        first sample, else 0.
         """
         # At the first sample copies of the command fill the queue. A product chooses
         # them, not a branch: in the loop of a batch `first` is a traced number.
-        pairs = zip(command * self.delay, queue, strict=True)
-        waiting = [first * sent + (1.0 - first) * queued for sent, queued in pairs]
-        line = (*waiting, *command)
-        acting = (line[0], line[1], line[2])
-        return acting, line[3:]
+        copies = command * self.delay
+        waiting = []
+        for copied, queued in zip(copies, queue, strict=True):
+            waiting.append(first * copied + (1.0 - first) * queued)
+        torque_1, torque_2, torque_3, *new_queue = (*waiting, *command)
+        return (torque_1, torque_2, torque_3), tuple(new_queue)
 
 
 @dataclass(frozen=True)
@@ -189,8 +203,7 @@ class Command:
     """What the law answers at a sample."""
 
     torque: Vector3  # the command [N m]: feedforward + feedback, limited
-    # of the model without an error [N m]; gravity_pd: of the weight
-    feedforward: Vector3
+    feedforward: Vector3  # what the model needs without an error [N m]
     feedback: Vector3  # due to the error [N m]
     desired: Reference
     error: Vector3  # desired - measured gamma [rad]
@@ -211,20 +224,23 @@ def is_above(value: Scalar) -> Scalar:
 
 def rotation_vector(quaternion: Quadruple) -> Triple:
     """Axis times angle, 0 to pi [rad], of a rotation; exact for tiny angles."""
-    sign = 2.0 * is_above(quaternion[3]) - 1.0
+    *_, real = quaternion
+    sign = 2.0 * is_above(real) - 1.0
     x, y, z, w = (sign * component for component in quaternion)
-    sine = gm.sqrt(x * x + y * y + z * z + 1e-300)
+    sine = gm.sqrt(x * x + y * y + z * z + _TINY_SQUARE)
     factor = 2.0 * gm.atan2(sine, w) / sine
     return factor * x, factor * y, factor * z
 
 
 class ControlLaw(NamedTuple):
-    """The law of some settings, and its numbers; by joint where there are three."""
+    """The law of some settings, and its numbers; by joint where there are three.
+
+    The model is two functions: `torque` gives torques [N m] by quaternion, W and W_dot,
+    `accelerate` W and W_dot as `ActuatorSpaceMap.star_motion` does.
+    """
 
     settings: ControllerSettings
-    # of the model, by quaternion, W and W_dot [N m]
     torque: Callable[[Any, Any, Any], Triple]
-    # W and W_dot of the model, see `ActuatorSpaceMap.star_motion`
     accelerate: Callable[..., Any]
     kp: Triple  # gains of accelerations [1/s^2]
     kd: Triple  # [1/s]
@@ -239,33 +255,39 @@ class ControlLaw(NamedTuple):
         self,
         desired: Reference,
         torques: Sequence[Triple],
-        gamma: Triple,
-        gamma_dot: Triple,
+        measured: Measurement,
         observed: Any,
         integral: Any,
         effort: Triple | None = None,
     ) -> Command:
         """Return the torques at a sample, of the measured angles and rates.
 
-        Angles are in rad, rates in rad/s. `torques` [N m] are those of the desired
-        motion, now and at the instant whose torque is held; `observed` is the
-        orientation at the measured angles, where the law needs it, and `integral` the
-        sum of errors [rad s], none without integral action. An `effort` [N m] is added
-        to the feedforward.
+        Args:
+            desired: where the motion is to be.
+            torques: those of the desired motion [N m], now and at the instant whose
+                torque is held.
+            measured: the angles [rad] and rates [rad/s].
+            observed: the orientation at the measured angles, where the law needs it.
+            integral: the sum of errors [rad s], none without integral action.
+            effort: torques [N m] that are added to the feedforward.
+
         """
         mode = self.settings.mode
         present_torque, held_torque = torques
         feedforward = held_torque if self.settings.feeds else ZERO
         feedback: Triple = ZERO
         summed: Triple = ZERO  # what the integral sums
-        error = axpy(1.0, desired.gamma, -1.0, gamma)
-        rates = axpy(1.0, desired.gamma_dot, -1.0, gamma_dot)
+        error = axpy(1.0, desired.gamma, -1.0, measured.gamma)
+        error_rate = axpy(1.0, desired.gamma_dot, -1.0, measured.gamma_dot)
         if mode == "gravity_pd":
             feedforward = self.torque(observed, ZERO, ZERO)
         if mode == "computed_torque":
-            gamma_ddot = add(desired.gamma_ddot, self._correct(integral, error, rates))
-            moving = self.accelerate(*observed, *gamma_dot, *gamma_ddot)
-            body_rate, acceleration = moving[:3], moving[3:]
+            correction = self._correct(integral, error, error_rate)
+            gamma_ddot = add(desired.gamma_ddot, correction)
+            star_motion = self.accelerate(*observed, *measured.gamma_dot, *gamma_ddot)
+            wx, wy, wz, *acceleration = star_motion
+            body_rate = (wx, wy, wz)
+            acceleration = triple(acceleration)
             summed = error
             if self.settings.space == "so3":
                 summed, acceleration = self._correct_on_so3(
@@ -275,7 +297,8 @@ class ControlLaw(NamedTuple):
             feedback = axpy(1.0, needed, -1.0, present_torque)
         elif mode != "feedforward":
             summed = error
-            feedback = _by_joint(self.inertia, self._correct(integral, error, rates))
+            correction = self._correct(integral, error, error_rate)
+            feedback = _by_joint(self.inertia, correction)
         if effort is not None:
             feedforward = add(feedforward, effort)
         total = add(feedforward, feedback)
@@ -287,7 +310,14 @@ class ControlLaw(NamedTuple):
         if integral:
             integral = axpy(1.0, integral, weight * self.period, summed)
         return Command(
-            torque, feedforward, feedback, desired, error, rates, integral, total
+            torque=torque,
+            feedforward=feedforward,
+            feedback=feedback,
+            desired=desired,
+            error=error,
+            error_rate=error_rate,
+            integral=integral,
+            total=total,
         )
 
     def _correct_on_so3(
@@ -295,21 +325,22 @@ class ControlLaw(NamedTuple):
     ) -> tuple[Triple, Triple]:
         """Error on SO(3) [rad], and W_dot [rad/s^2] that makes it vanish."""
         x, y, z, w = observed
-        between = gm.quaternion_product((-x, -y, -z, w), desired.quaternion)
-        turn = gm.rotation_rows(between)
-        rate = triple(gm.dot3(row, desired.body_rate) for row in turn)
-        forward = triple(gm.dot3(row, desired.body_acceleration) for row in turn)
-        moving = axpy(1.0, forward, -1.0, gm.cross3(body_rate, rate))
-        error = self.turn(between)
-        rates = axpy(1.0, rate, -1.0, body_rate)
-        return error, add(moving, self._correct(integral, error, rates))
+        to_desired = gm.quaternion_product((-x, -y, -z, w), desired.quaternion)
+        rows = gm.rotation_rows(to_desired)  # of R^T R_d
+        rate = triple(gm.dot3(row, desired.body_rate) for row in rows)
+        acceleration = triple(gm.dot3(row, desired.body_acceleration) for row in rows)
+        # d/dt(R^T R_d W_d)
+        feedforward = axpy(1.0, acceleration, -1.0, gm.cross3(body_rate, rate))
+        error = self.turn(to_desired)
+        error_rate = axpy(1.0, rate, -1.0, body_rate)
+        return error, add(feedforward, self._correct(integral, error, error_rate))
 
-    def _correct(self, integral: Any, error: Triple, rates: Triple) -> Triple:
+    def _correct(self, integral: Any, error: Triple, error_rate: Triple) -> Triple:
         """Acceleration kp e + kd e_dot, with integral action."""
         error_and_sum = error
         if integral:
             error_and_sum = axpy(1.0, error, self.integral_rate, integral)
-        return add(_by_joint(self.kp, error_and_sum), _by_joint(self.kd, rates))
+        return add(_by_joint(self.kp, error_and_sum), _by_joint(self.kd, error_rate))
 
 
 def _by_joint(factors: Triple, values: Triple) -> Triple:
@@ -326,23 +357,22 @@ def feedback_gains(
     stiffness and damping are given.
     """
     if direct:
-        kp, kd = (
-            np.reshape(value(name), (3, -1)) / inertia
-            for name in ("stiffness", "damping")
-        )
-        return kp, kd
+        stiffness = np.reshape(value("stiffness"), (3, -1))
+        damping = np.reshape(value("damping"), (3, -1))
+        return stiffness / inertia, damping / inertia
     ones = np.ones_like(inertia)
     bandwidth = value("bandwidth")
     return ones * bandwidth**2, ones * (2.0 * value("damping_ratio") * bandwidth)
 
 
 def command_limit(limit: Any, model: Scene) -> Array:
-    """Return the limit of commands [N m].
+    """Return the limit of commands [N m]: that of the settings, or of the actuators.
 
-    It is that of the settings, 0 for none, or less by the actuators.
+    The smaller one counts; 0 in the settings, or None of the actuators, is no limit.
     """
-    own = model.torque_limit or np.inf
-    return np.minimum(np.where(np.asarray(limit) > 0.0, limit, np.inf), own)
+    of_settings = np.where(np.asarray(limit) > 0.0, limit, np.inf)
+    of_actuators = model.torque_limit or np.inf
+    return np.minimum(of_settings, of_actuators)
 
 
 def bound(values: Triple, limit: Scalar) -> Triple:

@@ -32,6 +32,9 @@ from sst_ros.mechanism.generic_math import quaternion_rate, triple
 from sst_ros.mechanism.geometry import Geometry
 from sst_ros.scene.scene import Scene, SceneInput, scene_of, with_initial
 from sst_ros.state import (
+    QUATERNION,
+    STAR,
+    STAR_RATE,
     ZERO,
     Array,
     Explained,
@@ -42,18 +45,15 @@ from sst_ros.state import (
 )
 
 COORDINATES = {
-    "gamma": [f"{name}_{k}" for name in ("gamma", "gamma_dot") for k in (1, 2, 3)],
+    "gamma": [f"{name}_{leg}" for name in ("gamma", "gamma_dot") for leg in (1, 2, 3)],
     "star": [f"{name}_{axis}" for name in ("rotation", "body_rate") for axis in "xyz"],
 }
-_MOST_PERIOD_EVALUATIONS, _CHECKS = 20_000, 8
-"""Evaluations for a period: without end in a singularity.
-
-Parts after which limits are checked.
-"""
-
-
+# Evaluations of the dynamics for a period, at most: in a singularity there is no end.
+_MOST_PERIOD_EVALUATIONS = 20_000
+_CHECKS = 8  # parts of a period, after each of which limits are checked
+# A state this near to one of rest [rad], by the largest entry of A, counts as one.
 _REST = 1e-9
-"""A state this near to one of rest [rad], by the largest entry of A, counts as one."""
+_ROTATION_VECTOR = slice(0, 3)  # place in the coordinates of the star
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,10 +99,15 @@ class LinearModel(Explained, ReadOnly):
         Needs the package control.
         """
         x = list(self.states)
-        commands = [f"command_{k}" for k in (1, 2, 3)]
-        system = self.A, self.B, np.eye(len(x)), np.zeros_like(self.B), self.dt or 0
         return require("control").StateSpace(
-            *system, states=x, outputs=x, inputs=commands
+            self.A,
+            self.B,
+            np.eye(len(x)),
+            np.zeros_like(self.B),
+            self.dt or 0,
+            states=x,
+            outputs=x,
+            inputs=["command_1", "command_2", "command_3"],
         )
 
 
@@ -119,7 +124,7 @@ def equilibrium(scene: SceneInput, gamma: Any) -> State:
     """
     scene_at_rest = with_initial(scene_of(scene), (gamma, ZERO))
     y = start_of(scene_at_rest)
-    torque = InverseDynamics(scene_at_rest).gravity_torque(y[:4])
+    torque = InverseDynamics(scene_at_rest).gravity_torque(y[QUATERNION])
     return State.of(0, y, Dynamics.of(scene_at_rest).joints(*y), torque)
 
 
@@ -155,6 +160,37 @@ def linearize(
 
     """
     scene = scene_of(scene)
+    acting = _read_arguments(scene, torque, dt, coordinates)
+    start = _start_of(scene, state, acting)
+    by_gamma = coordinates == "gamma"
+    if by_gamma:
+        x, y, z, w = start[QUATERNION].tolist()
+        body_rate = triple(start[STAR_RATE].tolist())
+        # It refuses singularities.
+        InverseDynamics(scene).torque((x, y, z, w), body_rate, ZERO)
+    dynamics = Dynamics.of(scene)
+    by_star = None if by_gamma else trace_derivatives(scene, (), by_torque=True)
+    try:
+        begin = _differentiate(dynamics, by_star, start, acting)
+    except (ArithmeticError, ValueError):
+        raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
+    a = begin.A
+    b = begin.B
+    at_equilibrium = np.abs(begin.slope).max() <= _REST * np.abs(a).max()
+    if dt is not None:
+        dt = float(dt)
+        flow = _hold(scene, dynamics, start, acting, dt)
+        to_x = _coordinates_by_state(dynamics, flow.states[-1], acting, by_gamma)
+        a = to_x @ flow.by_start @ begin.y_by_x
+        b = to_x @ flow.by_torque
+    states = COORDINATES[coordinates].copy()
+    if scene.lags:
+        states += ["torque_1", "torque_2", "torque_3"]
+    return LinearModel(a, b, tuple(states), dt, bool(at_equilibrium))
+
+
+def _read_arguments(scene: Scene, torque: Any, dt: Any, coordinates: Any) -> Vector3:
+    """Return the torques of `linearize`; refuse arguments that are not allowed."""
     acting = finite_vector(torque)
     limit = scene.torque_limit
     largest = max(map(abs, acting or ZERO))
@@ -162,62 +198,58 @@ def linearize(
         f"must be at most {limit} N m, the torque limit: beyond it torques have no"
         " effect"
     )
-    positive = isinstance(dt, (int, float)) and dt is not True and 0.0 < dt < math.inf
+    is_positive = isinstance(dt, (int, float)) and dt is not True and 0 < dt < math.inf
     is_defined = isinstance(coordinates, str) and coordinates in COORDINATES
     refuse_unless(
         "linearize",
         ("torque", torque, acting is not None, "must be three finite torques [N m]"),
         ("torque", torque, limit is None or largest <= limit, beyond),
-        ("dt", dt, dt is None or positive, "must be a number > 0 [s]"),
+        ("dt", dt, dt is None or is_positive, "must be a number > 0 [s]"),
         ("coordinates", coordinates, is_defined, "must be gamma or star"),
     )
     assert acting is not None
+    return acting
+
+
+def _start_of(scene: Scene, state: Any, commanded: Vector3) -> Array:
+    """Return the state of the dynamics that `linearize` is given.
+
+    Where the actuators lag, the state has the torques that they give.
+    """
     if isinstance(state, State):
-        quaternion = state.quaternion
-        rate = state.body_rate
+        motion = [*state.quaternion, *state.body_rate]
         lagged = state.torque
     else:
-        x, y, z, w, *body_rate = start_of(with_initial(scene, state))
-        quaternion = (x, y, z, w)
-        rate = triple(body_rate)
-        lagged = acting
-    by_gamma = coordinates == "gamma"
-    if by_gamma:
-        InverseDynamics(scene).torque(quaternion, rate, ZERO)  # refuses singularities
-    dynamics = Dynamics.of(scene)
-    by_star = None if by_gamma else trace_derivatives(scene, (), by_torque=True)
-    start_state = np.array((*quaternion, *rate, *(lagged if scene.lags else ())))
-    try:
-        begin = _differentiate(dynamics, by_star, start_state, acting)
-    except (ArithmeticError, ValueError):
-        raise SingularConfiguration("serial singularity, sin(mu)", 0.0) from None
-    a, b = begin.A, begin.B
-    at_equilibrium = np.abs(begin.slope).max() <= _REST * np.abs(a).max()
-    if dt is not None:
-        dt = float(dt)
-        with np.errstate(all="ignore"):  # of steps that are too long
-            flow = follow_held_torque(
-                recent_ode(dynamics),
-                start_state.tolist(),
-                acting,
-                dt,
-                _MOST_PERIOD_EVALUATIONS,
-                elastic=scene.stroke.at_end == "elastic",
-            )
-        lasts = (
-            "must be a period for which the motion lasts: it meets a singularity or is"
-            " too long"
+        motion = [*start_of(with_initial(scene, state))[STAR]]
+        lagged = commanded
+    return np.array([*motion, *lagged] if scene.lags else motion)
+
+
+def _hold(
+    scene: Scene, dynamics: Dynamics, start: Array, torque: Vector3, dt: float
+) -> HeldFlow:
+    """Follow a motion under held torques for dt [s].
+
+    Raises InputError where it does not last, or meets a limit.
+    """
+    with np.errstate(all="ignore"):  # of steps that are too long
+        flow = follow_held_torque(
+            recent_ode(dynamics),
+            start.tolist(),
+            torque,
+            dt,
+            _MOST_PERIOD_EVALUATIONS,
+            elastic=scene.stroke.at_end == "elastic",
         )
-        if flow is not None:
-            lasts = _find_limit(scene, dynamics, flow, acting, dt)
-        refuse_unless("linearize", ("dt", dt, not lasts, lasts))
-        assert flow is not None
-        to_x = _coordinates_by_state(dynamics, flow.states[-1], acting, by_gamma)
-        a = to_x @ flow.by_start @ begin.y_by_x
-        b = to_x @ flow.by_torque
-    lag = [f"torque_{k}" for k in (1, 2, 3)] if scene.lags else []
-    states = (*COORDINATES[coordinates], *lag)
-    return LinearModel(a, b, states, dt, bool(at_equilibrium))
+    requirement = (
+        "must be a period for which the motion lasts: it meets a singularity or is"
+        " too long"
+    )
+    if flow is not None:
+        requirement = _find_limit(scene, dynamics, flow, torque, dt)
+    refuse_unless("linearize", ("dt", dt, not requirement, requirement))
+    assert flow is not None
+    return flow
 
 
 def _find_limit(
@@ -230,15 +262,12 @@ def _find_limit(
         *states_inside(recent_ode(dynamics), flow, torque, inside),
         flow.states[-1],
     ]
-    angles = np.array([dynamics.joints(*y[:7].tolist()) for y in states])
-    limits = list(limits_of(scene, Geometry.of(scene)))
-    ends = np.array([limit.end for limit in limits])
-    signs = np.array([limit.sign for limit in limits])
-    distances = signs * (angles[:, [limit.joint for limit in limits]] - ends)
-    passed = (distances[0] >= -GRAZING) & (distances.min(axis=0) < -GRAZING)
-    if not passed.any():
-        return ""
-    return f"must end before a limit: {limits[int(passed.argmax())].reason}"
+    joints = [dynamics.joints(*y[STAR].tolist()) for y in states]
+    for limit in limits_of(scene, Geometry.of(scene)):
+        distances = np.array([limit.distance(numbers) for numbers in joints])
+        if distances[0] >= -GRAZING and distances.min() < -GRAZING:
+            return f"must end before a limit: {limit.reason}"
+    return ""
 
 
 class _Derivatives(NamedTuple):
@@ -264,23 +293,26 @@ def _differentiate(
     """
     size = len(y)
     from_star, to_star = _turns(y)
+    # Rows of values, then of their derivatives by each number of y and each torque.
     if by_star is None:
-        table = np.array(
-            dynamics.actuator_motion(*y.tolist(), *_drive(dynamics, torque))
-        )
-        values_and_slopes = table.reshape(size + 4, -1)
-        x, x_dot = np.split(values_and_slopes[1:].T, 2)
-        slope = np.split(values_and_slopes[0], 2)[1]
-        from_gamma = from_star @ np.linalg.inv(x[:, :size] @ from_star)
-        a = x_dot[:, :size] @ from_gamma
-        return _Derivatives(x[:, :size], from_gamma, a, x_dot[:, size:], slope)
-    rows = np.array(by_star(*y.tolist(), *torque)).reshape(size + 4, size)
+        numbers = dynamics.actuator_motion(*y.tolist(), *_drive(dynamics, torque))
+        rows = np.array(numbers).reshape(1 + size + LEGS, -1)
+        _, slope = np.split(rows[0], 2)
+        x, x_dot = np.split(rows[1:].T, 2)
+        x_by_y, _ = np.split(x, [size], axis=1)
+        slope_by_y, slope_by_torque = np.split(x_dot, [size], axis=1)
+        from_gamma = from_star @ np.linalg.inv(x_by_y @ from_star)
+        a = slope_by_y @ from_gamma
+        return _Derivatives(x_by_y, from_gamma, a, slope_by_torque, slope)
+    rows = np.array(by_star(*y.tolist(), *torque)).reshape(1 + size + LEGS, size)
     if not np.isfinite(rows).all():
         raise ArithmeticError("the derivatives are not finite")
     slopes = to_star @ rows[1:].T
-    a = slopes[:, :size] @ from_star
-    a[:3, :3] = np.cross(y[4:7], np.eye(3))  # in the turning frame d' = dW - W x d
-    return _Derivatives(to_star, from_star, a, slopes[:, size:], rows[0])
+    slope_by_y, slope_by_torque = np.split(slopes, [size], axis=1)
+    a = slope_by_y @ from_star
+    # In the turning frame d' = dW - W x d.
+    a[_ROTATION_VECTOR, _ROTATION_VECTOR] = np.cross(y[STAR_RATE], np.eye(3))
+    return _Derivatives(to_star, from_star, a, slope_by_torque, rows[0])
 
 
 def _coordinates_by_state(
@@ -299,14 +331,18 @@ def _drive(dynamics: Dynamics, torque: Sequence[float]) -> tuple[float, ...]:
 
 
 def _turns(y: Array) -> tuple[Array, Array]:
-    """Return derivatives of a state by deviations of the star, and those of the latter.
+    """Return the derivatives of a state by deviations of the star, and their inverse.
 
-    Shapes (n + 1, n) and (n, n + 1).
+    The first have the shape (n + 1, n), those of the deviations by the state (n, n +
+    1).
     """
     size = len(y)
-    q = y[:4]
+    q = y[QUATERNION]
     by_axis = [quaternion_rate(tuple(q), tuple(axis)) for axis in np.eye(3)]
     turn = np.array(by_axis).T
-    from_star, to_star = np.eye(size, size - 1, -1), np.eye(size - 1, size, 1)
-    from_star[:4, :3], to_star[:3, :4] = turn, 4.0 * turn.T / (q @ q)
+    # A quaternion has one number more than the rotation; all else is the same.
+    from_star = np.eye(size, size - 1, -1)
+    from_star[QUATERNION, _ROTATION_VECTOR] = turn
+    to_star = np.eye(size - 1, size, 1)
+    to_star[_ROTATION_VECTOR, QUATERNION] = 4.0 * turn.T / (q @ q)
     return from_star, to_star

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -27,6 +28,7 @@ from sst_ros.control.controller import InverseDynamics
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.model import SINGULAR_MU
 from sst_ros.dynamics.reactions import SIZES, LoadFigures
+from sst_ros.dynamics.traced_dynamics import LEGS
 from sst_ros.errors import MotionRefused, Problem, SingularConfiguration
 from sst_ros.mechanism.generic_math import multiply
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -37,25 +39,29 @@ from sst_ros.simulation.trajectory import RunRecord, Trajectory
 
 PIECE_PARTS = 16  # parts of a piece of the motion; even, for Simpson's rule
 SINGULAR_J2 = 1e-6  # det J2 within which a motion counts as singular
-SLOWEST, FASTEST = 1e-4, 1e8  # factors of speed between which ends are looked for
+# Factors of speed between which ends are looked for.
+SLOWEST = 1e-4
+FASTEST = 1e8
+_GRID = 360  # factors between them that are tried first
+_FINE_INSTANTS = 33  # instants between two samples beside a peak of a reaction
 DEMAND_UNITS = {
     "torque": "N m",
     "power": "W",
     "velocity": "rad/s",
     "acceleration": "rad/s^2",
 }
-"""Of what a motion demands of an actuator.
+"""Units of what a motion demands of an actuator.
 
 Power is negative where the actuator brakes.
 """
-_GRID = 360  # factors to try
-_FINE_INSTANTS = 33  # instants between two samples beside a peak of a reaction
-# share of a maximum by which another must exceed it: less is rounding
-_LIMIT_ROUNDING = 1e-13
-# places of the first of three, and of det J2, in what `_distances` measures
-_GAMMA = 0
-_SIN_MU = 3
-_BETA = 6
+_DEMANDED_TORQUES = slice(0, LEGS)  # places in the demands of a sample
+# Share of a maximum by which another must exceed it: less is rounding.
+_MAXIMUM_ROUNDING = 1e-13
+_REFINEMENT = 1e-8  # of the time of a maximum, as a share of what it is sought in
+# Places of the first of three, and of det J2, in what `_distances` measures.
+_GAMMA_1 = 0
+_SIN_MU_1 = 3
+_BETA_1 = 6
 _DET_J2 = 9
 
 
@@ -98,22 +104,19 @@ class MotionPlan:
     trajectory: Trajectory
     # by quantity of DEMAND_UNITS and leg, the largest, with their signs
     peaks: dict[str, list[Peak]]
-    limits: dict[
-        str, float
-    ]  # those that the actuators have, by quantity of DEMAND_UNITS
+    # those that the actuators have, by quantity of DEMAND_UNITS
+    limits: dict[str, float]
     torque_rms: list[float]  # root of the mean square over the duration, by leg [N m]
     distances: tuple[LimitDistance, ...]  # from all limits
     problems: tuple[Problem, ...]  # reasons of a refusal; empty where it is feasible
 
 
 def check_motion(motion: ReferenceMotion, scene: Scene) -> MotionPlan:
-    """Examine a motion.
+    """Examine a motion; raise MotionRefused, with every reason, where it is infeasible.
 
-    Raises MotionRefused, with every reason, where it is infeasible.
-
-    It is where it leaves the stroke or the workspace, or exceeds a limit of the
-    actuators. Extremes of the plan are sought between samples only where one could lie
-    beyond a limit: that takes a tenth of the time of `examine_motion`.
+    A motion is infeasible where it leaves the stroke or the workspace, or exceeds a
+    limit of the actuators. Extremes of the plan are sought between samples only where
+    one could lie beyond a limit: that takes a tenth of the time of `examine_motion`.
     """
     plan = examine_motion(motion, scene, exact=False)
     if plan.problems:
@@ -126,12 +129,10 @@ def examine_motion(
 ) -> MotionPlan:
     """Compute demands of a motion and its distances from all limits.
 
-    Also between samples. Distances that lie inside all limits are not `exact` where
-    that is not asked for.
-
-    An external moment from a topic counts as zero; the lag of actuators is not
-    included. Raises SingularConfiguration where the motion meets a singularity: no
-    torque is defined there.
+    Extremes are sought between samples, too; where the result need not be `exact`, only
+    those that could lie beyond a limit. An external moment from a topic counts as zero;
+    the lag of actuators is not included. Raises SingularConfiguration where the motion
+    meets a singularity: no torque is defined there.
     """
     ends = pairwise(motion.pieces)
     piece_times = (
@@ -149,57 +150,70 @@ def examine_motion(
     def measure(reference: Reference) -> tuple[float, ...]:
         """Quantities of DEMAND_UNITS, each of three actuators."""
         torque = inverse.reference_torque(reference)
-        power = (x * rate for x, rate in zip(torque, reference.gamma_dot, strict=True))
+        power = map(operator.mul, torque, reference.gamma_dot)
         return (*torque, *power, *reference.gamma_dot, *reference.gamma_ddot)
+
+    samples, find = _sample(motion, measure, times, desired)
+    torques = samples[:, _DEMANDED_TORQUES]
+    peaks: dict[str, list[Peak]] = {}
+    for quantity, name in enumerate(DEMAND_UNITS):
+        floor = -math.inf if exact else limits.get(name, math.inf)
+        peaks[name] = []
+        for leg in range(LEGS):
+            index = LEGS * quantity + leg
+            highest = find(index, 1.0, floor)
+            lowest = find(index, -1.0, floor)
+            largest = max(highest, lowest, key=lambda peak: abs(peak.value))
+            peaks[name].append(largest)
+    return MotionPlan(
+        motion=motion,
+        trajectory=_trajectory_of(motion, scene, inverse, times, desired, torques),
+        peaks=peaks,
+        limits=limits,
+        torque_rms=_torque_rms(times, torques),
+        distances=distances,
+        problems=tuple(_faults(distances, peaks, limits)),
+    )
+
+
+def _trajectory_of(
+    motion: ReferenceMotion,
+    scene: Scene,
+    inverse: InverseDynamics,
+    times: Array,
+    desired: Sequence[Reference],
+    torques: Array,
+) -> Trajectory:
+    """Return a motion as a trajectory, of references and torques at times."""
 
     def states(times: Array) -> Array:
         """Quaternions, body rates and torques of the motion, shape (n, 10)."""
-        references = map(motion.at, times.tolist())
-        rows = [
-            (
-                *reference.quaternion,
-                *reference.body_rate,
-                *inverse.reference_torque(reference),
-            )
-            for reference in references
-        ]
+        rows = []
+        for reference in map(motion.at, times.tolist()):
+            torque = inverse.reference_torque(reference)
+            rows.append((*reference.quaternion, *reference.body_rate, *torque))
         return np.array(rows)
 
-    samples, find = _sample(motion, measure, times, desired)
-    star = np.array(
-        [(*reference.quaternion, *reference.body_rate) for reference in desired]
-    )
     # ends of pieces may be equal up to rounding
     t, rows = np.unique(times, return_index=True)
+    quaternions = np.array([reference.quaternion for reference in desired])
+    body_rates = np.array([reference.body_rate for reference in desired])
     law = FunctionTorque(lambda time: inverse.reference_torque(motion.at(time)))
     record = RunRecord(message="planned", law=law, dense=states)
-    trajectory = Trajectory(
-        scene, t, star[rows, :4], star[rows, 4:], samples[rows, :3], run=record
+    return Trajectory(
+        scene, t, quaternions[rows], body_rates[rows], torques[rows], run=record
     )
-    peaks = {}
-    for place, name in enumerate(DEMAND_UNITS):
-        first = 3 * place  # of the three actuators
-        floor = -math.inf if exact else limits.get(name, math.inf)
-        legs = range(first, first + 3)
-        extremes = (
-            [find(index, sign, floor) for sign in (1.0, -1.0)] for index in legs
-        )
-        peaks[name] = [max(pair, key=lambda peak: abs(peak.value)) for pair in extremes]
-    rms = _torque_rms(times, samples)
-    faults = tuple(_faults(distances, peaks, limits))
-    return MotionPlan(motion, trajectory, peaks, limits, rms, distances, faults)
 
 
-def _torque_rms(times: Array, samples: Array) -> list[float]:
-    """Return the root of the mean square of the torques [N m], by leg.
+def _torque_rms(times: Array, torques: Array) -> list[float]:
+    """Return the root of the mean square of torques (n, 3) at times [N m], by leg.
 
-    They are the first three numbers of each sample, shape (n, m). Each piece of the
-    motion has PIECE_PARTS parts, and shares its ends with the next.
+    Each piece of the motion has PIECE_PARTS parts, and shares its ends with the next.
     """
     first_rows = np.arange(0, len(times) - 1, PIECE_PARTS)
     piece_rows = first_rows[:, None] + np.arange(PIECE_PARTS + 1)
     of_pieces = simpson(
-        samples[piece_rows, :3] ** 2, x=times[piece_rows][..., None], axis=1
+        torques[piece_rows] ** 2, x=times[piece_rows][..., None], axis=1
     )
     rms: list[float] = np.sqrt(of_pieces.sum(axis=0) / times[-1]).tolist()
     return rms
@@ -211,11 +225,11 @@ def _sample(
     times: Array,
     desired: Sequence[Reference],
 ) -> tuple[Array, Callable[[int, float, float], Peak]]:
-    """Return m numbers at n references, (n, m), and what finds their extremes.
+    """Return m numbers at n references, (n, m), and a function of their extremes.
 
-    `measure` gives the numbers. What finds an extreme takes the index of a number, a
-    sign, +1 for its highest value or -1 for its lowest, and the floor of `maximum` for
-    the number times the sign.
+    `measure` gives the numbers. The function takes the index of a number, a sign, +1
+    for its highest value or -1 for its lowest, and the floor of `maximum` for the
+    number times the sign.
     """
     samples = np.array(list(map(measure, desired)))
 
@@ -244,23 +258,22 @@ def maximum(
     """
     top = int(np.argmax(values))
     best = Peak(float(values[top]), float(times[top]))
-    left, right = np.append(-np.inf, values[:-1]), np.append(values[1:], -np.inf)
-    below = np.minimum(
-        np.append(values[0], values[:-1]), np.append(values[1:], values[-1])
-    )
-    high = 2.0 * values - below > max(
-        best.value + _LIMIT_ROUNDING * abs(best.value), floor
-    )
-    for index in np.flatnonzero((values >= left) & (values >= right) & high):
-        bounds = times[max(index - 1, 0)], times[min(index + 1, len(times) - 1)]
-        options = {"xatol": 1e-8 * float(bounds[1] - bounds[0])}
+    # The neighbours; an end has no other than itself.
+    left = np.append(values[0], values[:-1])
+    right = np.append(values[1:], values[-1])
+    is_local_maximum = (values >= left) & (values >= right)
+    extrapolated = 2.0 * values - np.minimum(left, right)
+    to_exceed = max(best.value + _MAXIMUM_ROUNDING * abs(best.value), floor)
+    for index in np.flatnonzero(is_local_maximum & (extrapolated > to_exceed)):
+        begin = times[max(index - 1, 0)]
+        end = times[min(index + 1, len(times) - 1)]
         refined = minimize_scalar(
             lambda time: -function(time),
-            bounds=bounds,
+            bounds=(begin, end),
             method="bounded",
-            options=options,
+            options={"xatol": _REFINEMENT * float(end - begin)},
         )
-        if -refined.fun > best.value + _LIMIT_ROUNDING * abs(best.value):
+        if -refined.fun > best.value + _MAXIMUM_ROUNDING * abs(best.value):
             best = Peak(float(-refined.fun), float(refined.x))
     return best
 
@@ -285,14 +298,15 @@ def _distances(
         sin(mu) < 0 beyond a serial singularity.
         """
         posture = list(space.posture(*reference.quaternion))
-        turned = space.of_star(
+        of_star = space.of_star(
             reference.quaternion, reference.body_rate, reference.body_acceleration
-        ).gamma
-        for leg in range(3):
+        )
+        angles = zip(reference.gamma, of_star.gamma, strict=True)
+        for leg, (gamma, gamma_of_star) in enumerate(angles):
             # On the other branch of the leg r_k has the opposite direction: gamma
             # differs by pi.
-            if math.cos(reference.gamma[leg] - turned[leg]) < 0.0:
-                posture[leg] = -posture[leg]
+            if math.cos(gamma - gamma_of_star) < 0.0:
+                posture[leg] = -posture[leg]  # sin(mu) of the leg
         return (*reference.gamma, *posture)
 
     samples, find = _sample(motion, measure, times, desired)
@@ -307,23 +321,22 @@ def _distances(
             floor = -sign * end if enforced else math.inf
         return find(index, -sign, floor)
 
-    arcs = geometry.arc.tolist()
-    edges = [geometry.beta_max] * 3
-    in_stroke = scene.stroke.at_end != "ignore"
-    in_workspace = scene.workspace.at_edge != "ignore"
-    ranges = (
-        ("gamma", _GAMMA, arcs, in_stroke),
-        ("beta", _BETA, edges, in_workspace),
-    )
-    for name, first, ends, enforced in ranges:
-        for leg, most in enumerate(ends):
+    def between(
+        name: str, first: int, largest: Sequence[float], enforced: bool
+    ) -> Iterator[LimitDistance]:
+        """Yield the distances of an angle of each leg from 0 and from the largest."""
+        for leg, most in enumerate(largest):
             for end, sign in ((0.0, 1.0), (most, -1.0)):
                 reached = reach(first + leg, end, sign, enforced)
-                yield LimitDistance(
-                    f"{name}_{leg + 1}", end, sign, "rad", reached, enforced
-                )
+                key = f"{name}_{leg + 1}"
+                yield LimitDistance(key, end, sign, "rad", reached, enforced)
+
+    in_stroke = scene.stroke.at_end != "ignore"
+    in_workspace = scene.workspace.at_edge != "ignore"
+    yield from between("gamma", _GAMMA_1, geometry.arc.tolist(), in_stroke)
+    yield from between("beta", _BETA_1, [geometry.beta_max] * LEGS, in_workspace)
     for leg in (1, 2, 3):
-        low = reach(_SIN_MU + leg - 1, SINGULAR_MU, 1.0)
+        low = reach(_SIN_MU_1 + leg - 1, SINGULAR_MU, 1.0)
         if low.value < SINGULAR_MU:
             cause = f"serial singularity of leg {leg} at t = {low.time:.9g} s, sin(mu)"
             raise SingularConfiguration(cause, low.value)
@@ -335,8 +348,9 @@ def _distances(
     sign = math.copysign(1.0, samples[0, _DET_J2])
     nearest = reach(_DET_J2, sign * SINGULAR_J2, sign)
     if sign * nearest.value < SINGULAR_J2:
-        crosses = sign * nearest.value <= 0.0
-        time = brentq(determinant, 0.0, nearest.time) if crosses else nearest.time
+        time = nearest.time
+        if sign * nearest.value <= 0.0:  # it is crossed before
+            time = brentq(determinant, 0.0, nearest.time)
         cause = f"parallel singularity at t = {time:.9g} s, det J2"
         raise SingularConfiguration(cause, determinant(time))
     yield LimitDistance("det J2", 0.0, sign, "1", nearest, True)
@@ -397,50 +411,58 @@ def time_scaling(plan: MotionPlan) -> TimeScaling:
         return TimeScaling(highest, 0.0, binding)
     excess = _excess(plan, torque_limit)
     find_end = partial(brentq, excess, xtol=1e-300, rtol=4.0 * np.finfo(float).eps)
-    ends = SLOWEST * min(highest, 1.0), min(highest, FASTEST)
-    grid = np.geomspace(*ends, _GRID).tolist()
+    slowest = SLOWEST * min(highest, 1.0)
+    grid = np.geomspace(slowest, min(highest, FASTEST), _GRID).tolist()
     fits = [excess(factor) <= 0.0 for factor in grid]
     if not any(fits):
         return TimeScaling(None, 0.0, "torque")
     last = int(np.flatnonzero(fits)[-1])
     if last < _GRID - 1:
-        highest, binding = find_end(grid[last], grid[last + 1]), "torque"
-    slow = np.flatnonzero(np.logical_not(fits[:last]))
-    if len(slow):
-        return TimeScaling(
-            highest, find_end(grid[slow[-1]], grid[slow[-1] + 1]), binding
-        )
-    return TimeScaling(highest, 0.0 if excess(0.0) <= 0.0 else grid[0], binding)
+        highest = find_end(grid[last], grid[last + 1])
+        binding = "torque"
+    too_slow = np.flatnonzero(np.logical_not(fits[:last]))
+    if len(too_slow):
+        last_too_slow = too_slow[-1]
+        lowest = find_end(grid[last_too_slow], grid[last_too_slow + 1])
+    elif excess(0.0) <= 0.0:
+        lowest = 0.0
+    else:
+        lowest = grid[0]
+    return TimeScaling(highest, lowest, binding)
 
 
 def _excess(plan: MotionPlan, limit: float) -> Callable[[float], float]:
-    """Return by how much a torque exceeds the limit [N m] at a factor of speed.
+    """Return by how much a torque exceeds the limit [N m], as a function of the speed.
 
-    <= 0 for none.
+    The speed is a factor; where no torque exceeds the limit the number is <= 0.
     """
     scene = plan.trajectory.scene
     times = plan.trajectory.t
     model = kernel.model_of(scene)
     inverse = InverseDynamics(scene)
-    quaternion, rate = plan.trajectory.quaternion.T, plan.trajectory.body_rate.T
-    acceleration = np.array(
-        [plan.motion.at(time).body_acceleration for time in times.tolist()]
-    ).T
+    quaternion: Any = tuple(plan.trajectory.quaternion.T)
+    rate = plan.trajectory.body_rate.T
+    references = map(plan.motion.at, times.tolist())
+    acceleration = np.array([reference.body_acceleration for reference in references]).T
 
     def torque(factor: float, leg: int, sign: float, time: float) -> float:
         reference = plan.motion.at(time)
-        moving = (
+        torques = inverse.torque(
+            reference.quaternion,
             multiply(factor, reference.body_rate),
             multiply(factor * factor, reference.body_acceleration),
         )
-        return sign * inverse.torque(reference.quaternion, *moving)[leg]
+        return sign * torques[leg]
 
     def excess(factor: float) -> float:
-        moving: Any = [tuple(factor * rate), tuple(factor * factor * acceleration)]
-        rows, _ = kernel.actuator_torque(model, tuple(quaternion), *moving)
-        sampled = np.stack(np.broadcast_arrays(*rows))
+        scaled_rate: Any = tuple(factor * rate)
+        scaled_acceleration: Any = tuple(factor * factor * acceleration)
+        torques, _ = kernel.actuator_torque(
+            model, quaternion, scaled_rate, scaled_acceleration
+        )
+        sampled = np.stack(np.broadcast_arrays(*torques))
         largest = float(np.abs(sampled).max())
-        for leg, sign in product(range(3), (1.0, -1.0)):
+        for leg, sign in product(range(LEGS), (1.0, -1.0)):
             if largest <= limit:  # not above it yet
                 signed_torque = partial(torque, factor, leg, sign)
                 peak = maximum(signed_torque, times, sign * sampled[leg], limit)
@@ -461,20 +483,25 @@ def examine_reactions(plan: MotionPlan) -> dict[str, dict[str, LoadFigures]]:
     for figures in plan.trajectory.reactions.figures.values():
         for size in SIZES:
             for top in np.searchsorted(t, figures[size].time):
-                begin, end = max(int(top) - 1, 0), min(int(top) + 1, len(t) - 1)
+                begin = max(int(top) - 1, 0)
+                end = min(int(top) + 1, len(t) - 1)
                 windows.append(np.linspace(t[begin], t[end], _FINE_INSTANTS))
     return plan.trajectory.at(np.unique(np.concatenate(windows))).reactions.figures
 
 
 def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
     """Write a plan for machines: SI units, null for what does not exist."""
-    reactions = {
-        name: {
-            size: {figure: value.tolist() for figure, value in loads._asdict().items()}
-            for size, loads in figures.items()
-        }
-        for name, figures in examine_reactions(plan).items()
-    }
+    reactions: dict[str, dict[str, dict[str, Any]]] = {}
+    for joint_kind, figures in examine_reactions(plan).items():
+        reactions[joint_kind] = {}
+        for size, loads in figures.items():
+            reactions[joint_kind][size] = {
+                figure: value.tolist() for figure, value in loads._asdict().items()
+            }
+    actuators: list[dict[str, Any]] = []
+    for leg, rms in enumerate(plan.torque_rms):
+        demands = {name: asdict(peaks[leg]) for name, peaks in plan.peaks.items()}
+        actuators.append({**demands, "torque_rms": rms})
     highest = fastest.highest
     any_speed = highest is not None and math.isinf(highest)
     plan_document = {
@@ -483,11 +510,7 @@ def plan_json(plan: MotionPlan, fastest: TimeScaling) -> str:
         "feasible": not plan.problems,
         "problems": [str(problem) for problem in plan.problems],
         "limits": plan.limits,
-        "actuators": [
-            {name: asdict(peaks[leg]) for name, peaks in plan.peaks.items()}
-            | {"torque_rms": plan.torque_rms[leg]}
-            for leg in range(3)
-        ],
+        "actuators": actuators,
         "reactions": reactions,
         "distances": [
             {**asdict(distance), "least": distance.least} for distance in plan.distances
@@ -514,8 +537,6 @@ def write_torques(plan: MotionPlan, path: Path, period: float) -> None:
         middle = (k + 0.5) * period
         if k == count:
             middle = math.inf
-        reference = motion.at(middle)
-        lines.append(
-            ",".join(map(repr, (k * period, *inverse.reference_torque(reference))))
-        )
+        torque = inverse.reference_torque(motion.at(middle))
+        lines.append(",".join(map(repr, (k * period, *torque))))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

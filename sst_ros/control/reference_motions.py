@@ -15,8 +15,8 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
-from operator import itemgetter
-from typing import Any, TypeAlias
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,13 +55,45 @@ SAMPLES_A_PIECE = 8
 KEPT_STEP = 0.03  # distance in gamma [rad] between orientations that are kept
 LONGEST_PIECE = 100.0  # longest path in gamma [rad] within a piece of a motion
 NEAR = 0.1  # largest distance of a first point at time 0 from the start [rad]
-_SAMPLES = 16
+_SAMPLES = 16  # of a piece, by which the length of its path is estimated
 
-# Share of the path to the turn from the start, and to W and its derivative by that
-# share.
-StarPath: TypeAlias = Callable[[float], tuple[Quaternion, Vector3, Vector3]]
-# Time [s] to gamma [rad], gamma_dot [rad/s], gamma_ddot [rad/s^2].
-ActuatorPath: TypeAlias = Callable[[float], tuple[Vector3, Vector3, Vector3]]
+
+class StarPoint(NamedTuple):
+    """Where a path of the star is at a share of it, as a turn from the start."""
+
+    turn: Quaternion
+    slope: Vector3  # W by the share [rad]
+    curvature: Vector3  # the derivative of the slope by the share [rad]
+
+
+class ActuatorPoint(NamedTuple):
+    """Where a path of the actuators is at a time."""
+
+    gamma: Vector3  # [rad]
+    gamma_dot: Vector3  # [rad/s]
+    gamma_ddot: Vector3  # [rad/s^2]
+
+
+class KeptOrientation(NamedTuple):
+    """An orientation on a path of the actuators, from which others are computed."""
+
+    time: float
+    quaternion: Quaternion
+    gamma: Vector3
+    sigma: float  # bound below the least singular value of J2
+
+
+class Sine(NamedTuple):
+    """The motion of an actuator in a sweep."""
+
+    middle: float  # [rad]
+    amplitude: float  # [rad]
+    frequency: float  # at the start [rad/s]
+    frequency_slope: float  # [rad/s^2]
+
+
+StarPath: TypeAlias = Callable[[float], StarPoint]  # of the share of the path
+ActuatorPath: TypeAlias = Callable[[float], ActuatorPoint]  # of the time [s]
 OpenPoints: TypeAlias = Sequence[Sequence[float] | None]
 
 
@@ -79,7 +111,8 @@ def reference_motion(
     motion meets a parallel singularity.
     """
     scene = scene_of(scene)
-    motion, geometry = scene.motion, Geometry.of(scene)
+    geometry = Geometry.of(scene)
+    motion = scene.motion
     if motion is None:
         raise refusal(scene.name, "motion", None, "the scene has no desired motion")
     if motion.recorded:
@@ -87,41 +120,43 @@ def reference_motion(
         if read_motion is None:
             requirement = "a recorded motion cannot be read here"
             raise refusal(scene.name, "motion.recorded", bag, requirement)
-        trajectory = read_motion(bag, motion.recorded.namespace)
-        x, y, z, w = trajectory.quaternion[0].tolist()
-        return through_samples(
-            geometry, (x, y, z, w), trajectory.t, trajectory.gamma, trajectory.gamma_dot
-        )
+        run = read_motion(bag, motion.recorded.namespace)
+        x, y, z, w = run.quaternion[0].tolist()
+        return through_samples(geometry, (x, y, z, w), run.t, run.gamma, run.gamma_dot)
     gamma = scene.initial.gamma
-    x, y, z, w = initial_state(scene, geometry)[:4]
+    x, y, z, w, *_ = initial_state(scene, geometry)
     start = (x, y, z, w)
-    if turn := motion.to_orientation:
+    if motion.to_orientation:
+        turn = motion.to_orientation
         return geodesic_motion(geometry, start, turn.orientation, turn.duration)
     if motion.spiral:
         return spiral_motion(geometry, start, motion.spiral)
     if motion.waypoints:
-        points = [
-            (point.time, point.gamma, point.gamma_dot, point.gamma_ddot)
-            for point in motion.waypoints
-        ]
+        points = motion.waypoints
         try:
-            return through_points(geometry, start, *zip(*points, strict=True))
+            return through_points(
+                geometry,
+                start,
+                times=[point.time for point in points],
+                positions=[point.gamma for point in points],
+                velocities=[point.gamma_dot for point in points],
+                accelerations=[point.gamma_ddot for point in points],
+            )
         except InputError as error:
-            raise InputError(
-                f"{scene.name}: motion.waypoints", error.problems
-            ) from None
+            origin = f"{scene.name}: motion.waypoints"
+            raise InputError(origin, error.problems) from None
     if motion.sweep:
         centre = motion.sweep.centre or gamma
         if centre != gamma:
             start = follow_assembly(geometry, start, gamma, centre)
-        return move_actuators(geometry, *_sweep_path(motion.sweep, centre), start)
+        path, piece_ends = _sweep_path(motion.sweep, centre)
+        return move_actuators(geometry, path, piece_ends, start)
     goal = motion.to_angles
     assert goal is not None
     span = axpy(1.0, goal.gamma, -1.0, gamma)
     path = partial(_on_line, gamma, span, goal.duration)
-    return move_actuators(
-        geometry, path, equal_pieces(goal.duration, 2 * PIECES), start
-    )
+    piece_ends = equal_pieces(goal.duration, 2 * PIECES)
+    return move_actuators(geometry, path, piece_ends, start)
 
 
 # The paths below are functions of the module, which pickle takes, with their numbers in
@@ -130,22 +165,22 @@ def reference_motion(
 
 def _on_line(
     gamma: Vector3, span: Vector3, duration: float, time: float
-) -> tuple[Vector3, Vector3, Vector3]:
-    """Return gamma and its derivatives at a time [s] of a straight motion.
-
-    The motion goes from gamma over a span [rad].
-    """
+) -> ActuatorPoint:
+    """Return the point at a time [s] of a straight motion from gamma over a span."""
     s, rate, acceleration = minimum_jerk(time, duration)
-    return axpy(1.0, gamma, s, span), multiply(rate, span), multiply(acceleration, span)
+    return ActuatorPoint(
+        axpy(1.0, gamma, s, span), multiply(rate, span), multiply(acceleration, span)
+    )
 
 
 def minimum_jerk(time: float, duration: float = 1.0) -> tuple[float, float, float]:
-    """Return the minimum-jerk course from 0 to 1 over a duration.
+    """Return the minimum-jerk course from 0 to 1, and its two derivatives by time.
 
-    It is at rest at both ends. Its two derivatives by time are returned with it.
+    It is at rest at both ends.
     """
     u = time / duration
-    remaining, square = 1.0 - u, u * u
+    remaining = 1.0 - u
+    square = u * u
     return (
         square * u * (10.0 + u * (6.0 * u - 15.0)),
         30.0 * square * remaining * remaining / duration,
@@ -158,10 +193,12 @@ def move_star(
 ) -> ReferenceMotion:
     """Return a motion of the star along a path, with minimum jerk.
 
-    It turns by `turn` [rad].
+    The star turns by about `turn` [rad], which decides on the number of pieces.
     """
-    space, (x, y, z, w), length = ActuatorSpaceMap(geometry), start, math.hypot(*start)
-    begin = x / length, y / length, z / length, w / length
+    space = ActuatorSpaceMap(geometry)
+    length = math.hypot(*start)
+    x, y, z, w = start
+    begin = (x / length, y / length, z / length, w / length)
     count = PIECES + math.ceil(turn / (0.5 * math.pi)) * PIECES
     inside = partial(_on_star_path, space, begin, path, duration)
     return ReferenceMotion(inside, equal_pieces(duration, count))
@@ -176,9 +213,12 @@ def _on_star_path(
 ) -> Reference:
     """Return the reference of `move_star` at a time [s]."""
     s, rate, acceleration = minimum_jerk(time, duration)
-    turned, u, slope = path(s)
-    quaternion, moving = quaternion_product(begin, turned), multiply(rate, u)
-    return space.of_star(quaternion, moving, axpy(acceleration, u, rate * rate, slope))
+    point = path(s)
+    return space.of_star(
+        quaternion_product(begin, point.turn),
+        multiply(rate, point.slope),
+        axpy(acceleration, point.slope, rate * rate, point.curvature),
+    )
 
 
 def geodesic_motion(
@@ -197,13 +237,12 @@ def geodesic_motion(
     return move_star(geometry, start, path, duration, angle)
 
 
-def _on_geodesic(
-    vector: Vector3, angle: float, s: float
-) -> tuple[Quaternion, Vector3, Vector3]:
-    """Return what `StarPath` says, of a turn about one axis."""
+def _on_geodesic(vector: Vector3, angle: float, s: float) -> StarPoint:
+    """Return the point at a share of a turn about one axis."""
     half = 0.5 * s * angle
     factor = math.sin(half) / angle if angle else 0.0
-    return (*multiply(factor, vector), math.cos(half)), vector, ZERO
+    x, y, z = multiply(factor, vector)
+    return StarPoint((x, y, z, math.cos(half)), slope=vector, curvature=ZERO)
 
 
 def spiral_motion(
@@ -215,32 +254,41 @@ def spiral_motion(
     torsion: at phi = 0 the star only turns by psi about E, so the motion is smooth
     where ZYZ angles are not.
     """
-    theta, phi, psi = spiral.theta, spiral.phi, spiral.psi
-    path, turn = partial(_on_spiral, theta, phi, psi), abs(theta) + abs(phi) + abs(psi)
+    theta = spiral.theta
+    phi = spiral.phi
+    psi = spiral.psi
+    turn = abs(theta) + abs(phi) + abs(psi)
+    path = partial(_on_spiral, theta, phi, psi)
     return move_star(geometry, start, path, spiral.duration, turn)
 
 
-def _on_spiral(
-    theta: float, phi: float, psi: float, s: float
-) -> tuple[Quaternion, Vector3, Vector3]:
-    """Return what `StarPath` says, of `spiral_motion`."""
+def _on_spiral(theta: float, phi: float, psi: float, s: float) -> StarPoint:
+    """Return the point at a share of the path of `spiral_motion`."""
     third = psi - theta
     b = s * phi
     c = s * third
     difference = 0.5 * s * (third - theta)
     total = 0.5 * s * psi
     sine, cosine = math.sin(0.5 * b), math.cos(0.5 * b)
-    x, y = sine * math.sin(difference), sine * math.cos(difference)
-    q = x, y, cosine * math.sin(total), cosine * math.cos(total)
-    # W by s, and its derivative.
-    sb, cb, sc, cc = math.sin(b), math.cos(b), math.sin(c), math.cos(c)
-    u = (-theta * sb * cc + phi * sc, theta * sb * sc + phi * cc, theta * cb + third)
+    turn = (
+        sine * math.sin(difference),
+        sine * math.cos(difference),
+        cosine * math.sin(total),
+        cosine * math.cos(total),
+    )
+    sb, cb = math.sin(b), math.cos(b)
+    sc, cc = math.sin(c), math.cos(c)
     slope = (
+        -theta * sb * cc + phi * sc,
+        theta * sb * sc + phi * cc,
+        theta * cb + third,
+    )
+    curvature = (
         -theta * (phi * cb * cc - third * sb * sc) + phi * third * cc,
         theta * (phi * cb * sc + third * sb * cc) - phi * third * sc,
         -theta * phi * sb,
     )
-    return q, u, slope
+    return StarPoint(turn, slope, curvature)
 
 
 def move_actuators(
@@ -253,15 +301,15 @@ def move_actuators(
 
     The orientation is that of one assembly mode. Orientations are computed once along
     the path, by `continuation` in steps that cannot leave the assembly mode; any other
-    orientation is computed from the nearest of these. The motion therefore does not
-    depend on what was asked before. It starts from an orientation (x, y, z, w). Raises
-    SingularConfiguration, with the time, where the path meets a parallel singularity,
-    InputError where a piece is longer than LONGEST_PIECE, AssemblyError where it does
-    not begin at that orientation.
+    orientation is computed from the last of these before it. So the motion does not
+    depend on the times that it was computed at before. It starts from an orientation
+    (x, y, z, w). Raises SingularConfiguration, with the time, where the path meets a
+    parallel singularity, InputError where a piece is longer than LONGEST_PIECE,
+    AssemblyError where it does not begin at that orientation.
     """
     space = ActuatorSpaceMap(geometry)
     times = _choose_times(path, piece_ends)
-    gammas = [path(time)[0] for time in times]
+    gammas = [path(time).gamma for time in times]
     try:
         rotations, sigmas = continuation.follow(
             geometry, gammas, rotation_matrix(start)
@@ -272,29 +320,35 @@ def move_actuators(
             f"{cause}, least singular value of J2", error.measure
         ) from error
     quaternions = quaternion_of(rotations)
-    # Their signs change as little as they can.
-    turns = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
-    signs = np.cumprod(np.where(turns < 0.0, -1.0, 1.0))
+    # Of the two signs each has that of the quaternion before it.
+    cosines = np.sum(quaternions * np.vstack([start, quaternions[:-1]]), axis=1)
+    signs = np.cumprod(np.where(cosines < 0.0, -1.0, 1.0))
     orientations = map(tuple, (signs[:, None] * quaternions).tolist())
-    kept = list(zip(times, orientations, gammas, sigmas.tolist(), strict=True))
+    rows = zip(times, orientations, gammas, sigmas.tolist(), strict=True)
+    kept = [KeptOrientation(*row) for row in rows]
     return ReferenceMotion(partial(_on_path, space, path, kept), piece_ends)
 
 
 def _on_path(
-    space: ActuatorSpaceMap, path: ActuatorPath, kept: Any, time: float
+    space: ActuatorSpaceMap,
+    path: ActuatorPath,
+    kept: Sequence[KeptOrientation],
+    time: float,
 ) -> Reference:
-    """Return the reference at a time [s]; a function of a module, which pickle takes.
-
-    Each of what is kept is a time, the orientation and gamma there, and the singular
-    value of J2.
-    """
+    """Return the reference at a time [s] on a path of the actuators."""
     gamma, gamma_dot, gamma_ddot = path(time)
-    _, kept_quaternion, kept_gamma, sigma = kept[
-        max(bisect_right(kept, time, key=itemgetter(0)) - 1, 0)
-    ]
-    q = space.follow(kept_quaternion, kept_gamma, gamma, sigma)
-    star: Any = space.star_motion(*q, *gamma_dot, *gamma_ddot)
-    return Reference(q, star[:3], star[3:], gamma, gamma_dot, gamma_ddot)
+    later = bisect_right(kept, time, key=attrgetter("time"))
+    near = kept[max(later - 1, 0)]
+    q = space.follow(near.quaternion, near.gamma, gamma, near.sigma)
+    wx, wy, wz, ax, ay, az = space.star_motion(*q, *gamma_dot, *gamma_ddot)
+    return Reference(
+        quaternion=q,
+        body_rate=(wx, wy, wz),
+        body_acceleration=(ax, ay, az),
+        gamma=gamma,
+        gamma_dot=gamma_dot,
+        gamma_ddot=gamma_ddot,
+    )
 
 
 def _choose_times(path: ActuatorPath, piece_ends: tuple[float, ...]) -> list[float]:
@@ -304,9 +358,8 @@ def _choose_times(path: ActuatorPath, piece_ends: tuple[float, ...]) -> list[flo
     """
     times = [np.zeros(1)]
     for begin, end in pairwise(piece_ends):
-        rough = [
-            path(time)[0] for time in np.linspace(begin, end, _SAMPLES + 1).tolist()
-        ]
+        rough_times = np.linspace(begin, end, _SAMPLES + 1).tolist()
+        rough = [path(time).gamma for time in rough_times]
         length = sum(math.dist(a, b) for a, b in pairwise(rough))
         requirement = (
             f"must be less than {LONGEST_PIECE:g} rad"
@@ -319,7 +372,7 @@ def _choose_times(path: ActuatorPath, piece_ends: tuple[float, ...]) -> list[flo
         count = max(_SAMPLES, math.ceil(4.0 * length / KEPT_STEP))
         times.append(np.linspace(begin, end, count + 1)[1:])
     fine = np.concatenate(times)
-    gammas = np.array([path(time)[0] for time in fine.tolist()])
+    gammas = np.array([path(time).gamma for time in fine.tolist()])
     passed = np.cumsum(np.linalg.norm(np.diff(gammas, axis=0), axis=1))
     # The first of each half a KEPT_STEP of the path.
     _, kept = np.unique(np.append(0.0, passed) // (0.5 * KEPT_STEP), return_index=True)
@@ -329,42 +382,50 @@ def _choose_times(path: ActuatorPath, piece_ends: tuple[float, ...]) -> list[flo
 def _sweep_path(
     sweep: Sweep, centre: Vector3
 ) -> tuple[ActuatorPath, tuple[float, ...]]:
-    """Sines that fade in and out, and pieces of a quarter of a period or less."""
-    last = sweep.last_frequency or sweep.frequency
+    """Return sines that fade in and out, and pieces of a quarter period or less."""
+    first = sweep.frequency
+    last = sweep.last_frequency or first
     fade = sweep.fade
     duration = sweep.duration
-    slopes = [(b - a) / duration for a, b in zip(sweep.frequency, last, strict=True)]
-    rows = list(zip(centre, sweep.amplitude, sweep.frequency, slopes, strict=True))
-    fastest = max(map(abs, (*sweep.frequency, *last)))
+    sines = []
+    for leg in range(3):
+        slope = (last[leg] - first[leg]) / duration
+        sines.append(Sine(centre[leg], sweep.amplitude[leg], first[leg], slope))
+    fastest = max(map(abs, (*first, *last)))
     quarters = math.ceil(fastest * duration / (0.5 * math.pi))
     piece_ends = {
         *equal_pieces(duration, max(quarters, 2 * PIECES)),
         fade,
         duration - fade,
     }
-    return partial(_on_sines, rows, fade, duration), tuple(sorted(piece_ends))
+    return partial(_on_sines, sines, fade, duration), tuple(sorted(piece_ends))
 
 
 def _on_sines(
-    rows: Sequence[tuple[float, float, float, float]],
-    fade: float,
-    duration: float,
-    time: float,
-) -> tuple[Vector3, Vector3, Vector3]:
-    """Return gamma and its derivatives at a time [s], of `_sweep_path`."""
-    e, e1, e2 = 1.0, 0.0, 0.0  # the fading, and its derivatives by time
+    sines: Sequence[Sine], fade: float, duration: float, time: float
+) -> ActuatorPoint:
+    """Return the point at a time [s] of the path of a sweep."""
+    # the fading, and its derivatives by time
+    e = 1.0
+    e1 = 0.0
+    e2 = 0.0
     if not fade <= time <= duration - fade:
         e, e1, e2 = minimum_jerk(min(time, duration - time), fade)
         e1 = e1 if time < fade else -e1
-    p, v, a = [], [], []
-    for middle, amplitude, first, slope in rows:
-        angle, frequency = time * (first + 0.5 * slope * time), first + slope * time
+    gamma = []
+    gamma_dot = []
+    gamma_ddot = []
+    for middle, amplitude, first, slope in sines:
+        angle = time * (first + 0.5 * slope * time)
+        frequency = first + slope * time
+        # the sine, and its derivatives by time
         s, c = math.sin(angle), math.cos(angle)
-        s1, s2 = frequency * c, slope * c - frequency * frequency * s
-        p.append(middle + amplitude * e * s)
-        v.append(amplitude * (e1 * s + e * s1))
-        a.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
-    return triple(p), triple(v), triple(a)
+        s1 = frequency * c
+        s2 = slope * c - frequency * frequency * s
+        gamma.append(middle + amplitude * e * s)
+        gamma_dot.append(amplitude * (e1 * s + e * s1))
+        gamma_ddot.append(amplitude * (e2 * s + 2.0 * e1 * s1 + e * s2))
+    return ActuatorPoint(triple(gamma), triple(gamma_dot), triple(gamma_ddot))
 
 
 def through_points(
@@ -386,18 +447,17 @@ def through_points(
     nothing in place of a row) are zero at the ends and chosen for minimum jerk between
     them. Raises InputError for points that make no motion, and as `move_actuators`.
     """
-    checks: list[Check] = [
-        ("points", len(times), len(times) > 0, "must be one or more")
-    ]
-    names = "times", "positions", "velocities", "accelerations"
-    columns = [[time] for time in times], positions, velocities, accelerations
-    rows = [
-        _read_rows(name, column, len(times), checks)
-        for name, column in zip(names, columns, strict=True)
-    ]
+    count = len(times)
+    checks: list[Check] = [("points", count, count > 0, "must be one or more")]
+    time_rows = _read_rows("times", [[time] for time in times], count, checks)
+    position_rows = _read_rows("positions", positions, count, checks)
+    velocity_rows = _read_rows("velocities", velocities, count, checks)
+    acceleration_rows = _read_rows("accelerations", accelerations, count, checks)
     refuse_unless("trajectory", *checks)
-    point_times, gamma, rates, seconds = map(np.array, rows)
-    point_times = point_times.ravel()
+    point_times = np.array(time_rows).ravel()
+    gamma = np.array(position_rows)
+    rates = np.array(velocity_rows)
+    second_rates = np.array(acceleration_rows)
     refuse_unless("trajectory", *_check_points(point_times, rates))
     start_gamma = kinematics.inverse(geometry, rotation_matrix(start))[0]
     if point_times[0] > 0.0:
@@ -405,18 +465,16 @@ def through_points(
         point_times = np.append(0.0, point_times)
         gamma = np.vstack([start_gamma, gamma])
         rates = np.vstack([begin_rate, rates])
-        seconds = np.vstack([begin_acceleration, seconds])
-    requirement = "must be within {:g} rad of the start, ({:.6g}, {:.6g}, {:.6g}) rad"
+        second_rates = np.vstack([begin_acceleration, second_rates])
     first = gamma[0].tolist()
+    start_text = ", ".join(f"{angle:.6g}" for angle in start_gamma)
+    requirement = f"must be within {NEAR:g} rad of the start, ({start_text}) rad"
     is_near = np.abs(gamma[0] - start_gamma).max() <= NEAR
-    refuse_unless(
-        "trajectory",
-        ("positions[0]", first, is_near, requirement.format(NEAR, *start_gamma)),
-    )
-    for ends in (rates[0], rates[-1], seconds[0], seconds[-1]):
+    refuse_unless("trajectory", ("positions[0]", first, is_near, requirement))
+    for ends in (rates[0], rates[-1], second_rates[0], second_rates[-1]):
         ends[np.isnan(ends)] = 0.0
     begun = follow_assembly(geometry, start, start_gamma, gamma[0])
-    path = partial(_on_curve, quintic(point_times, gamma, rates, seconds))
+    path = partial(_on_curve, quintic(point_times, gamma, rates, second_rates))
     return move_actuators(geometry, path, tuple(point_times.tolist()), begun)
 
 
@@ -429,27 +487,23 @@ def through_samples(
 ) -> ReferenceMotion:
     """Return the motion through dense samples, quintic between them.
 
-    It may begin and end moving.
-
-    It begins with the first sample, from an orientation (x, y, z, w). Samples are
-    rising times [s], shape (n,), gamma [rad] and gamma_dot [rad/s], shape (n, 3).
-    Raises as `move_actuators`.
+    It begins with the first sample, from an orientation (x, y, z, w), and may begin and
+    end moving. Samples are rising times [s], shape (n,), gamma [rad] and gamma_dot
+    [rad/s], shape (n, 3). Raises as `move_actuators`.
     """
-    times, gamma = times - times[0], np.unwrap(positions, axis=0)
+    times = times - times[0]
+    gamma = np.unwrap(positions, axis=0)
+    open_accelerations = np.full_like(gamma, np.nan)
     piece_ends = (*times[:-1:SAMPLES_A_PIECE].tolist(), float(times[-1]))
-    path = partial(
-        _on_curve, quintic(times, gamma, velocities, np.full_like(gamma, np.nan))
-    )
+    curve = quintic(times, gamma, velocities, open_accelerations)
+    path = partial(_on_curve, curve)
     return move_actuators(geometry, path, piece_ends, start)
 
 
 def _read_rows(
     name: str, rows: OpenPoints | None, count: int, checks: list[Check]
 ) -> list[list[float]]:
-    """Read rows of numbers; one that is open becomes NaN.
-
-    What they must be joins the checks.
-    """
+    """Read rows of numbers, NaN for open ones; append to checks what they must be."""
     rows = [None] * count if rows is None else rows
     rows_requirement = f"must have a row for each of {count} points"
     checks.append((name, len(rows), len(rows) == count, rows_requirement))
@@ -491,8 +545,9 @@ def _check_points(point_times: Array, rates: Array) -> Iterator[Check]:
         yield f"velocities[{end}]", rates[end].tolist(), still, requirement
 
 
-def _on_curve(curve: PPoly, time: float) -> tuple[Vector3, Vector3, Vector3]:
-    return triple(map(triple, curve(time).tolist()))
+def _on_curve(curve: PPoly, time: float) -> ActuatorPoint:
+    gamma, gamma_dot, gamma_ddot = map(triple, curve(time).tolist())
+    return ActuatorPoint(gamma, gamma_dot, gamma_ddot)
 
 
 _UNIT_QUINTIC = BPoly.from_derivatives([0.0, 1.0], np.eye(6).reshape(2, 3, 6))
@@ -516,22 +571,20 @@ def quintic(
     _complete(nodes, lengths)
     # derivatives by the time of a segment, from 0 to 1
     powers = lengths[:, None] ** np.arange(6)
-    ends = (
-        np.concatenate([nodes[:-1], nodes[1:]], axis=1) * powers[:, [0, 1, 2] * 2, None]
-    )
+    of_ends = powers[:, [0, 1, 2, 0, 1, 2], None]
+    ends = np.concatenate([nodes[:-1], nodes[1:]], axis=1) * of_ends
     unit = PPoly.from_bernstein_basis(_UNIT_QUINTIC).c[:, 0]
-    path = PPoly(
-        np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None], point_times
-    )
+    coefficients = np.einsum("ij,njm->inm", unit, ends) / powers.T[::-1, :, None]
+    path = PPoly(coefficients, point_times)
     derivatives = [path.derivative(order).c for order in range(3)]
     padded = [np.pad(c, ((6 - len(c), 0), (0, 0), (0, 0))) for c in derivatives]
     return PPoly(np.stack(padded, axis=2), point_times)
 
 
 def _complete(nodes: Array, lengths: Array) -> None:
-    """Fill in what is open in nodes, shape (n, 3, m), in place.
+    """Fill in open numbers of nodes, shape (n, 3, m), in place.
 
-    What is filled in has the least integral of jerk^2.
+    Of all choices they have the least integral of the jerk squared.
     """
     usual = float(np.median(lengths))
     # A velocity times the usual length has the size of a position: the system stays
@@ -539,15 +592,16 @@ def _complete(nodes: Array, lengths: Array) -> None:
     scale = np.array([1.0, usual, usual * usual])[:, None]
     jerk = PPoly.from_bernstein_basis(_UNIT_QUINTIC.derivative(3)).c[::-1, 0]
     h = (lengths / usual)[:, None, None]
-    powers = h ** np.array([0, 1, 2] * 2)
+    powers = h ** np.array([0, 1, 2, 0, 1, 2])
     # The integral of the jerk squared, as a form in the six numbers at the ends of each
     # segment.
     forms = np.swapaxes(powers, 1, 2) * (jerk.T @ hilbert(3) @ jerk) * powers / h**5
-    # of these numbers among all
+    # places of these numbers among those of all nodes
     places = 3 * np.arange(len(lengths))[:, None] + np.arange(6)
     rows, columns = np.broadcast_arrays(places[:, :, None], places[:, None])
     hessian = csc_array((forms.ravel(), (rows.ravel(), columns.ravel())))
-    for column in range(nodes.shape[2]):
+    *_, column_count = nodes.shape
+    for column in range(column_count):
         x = (nodes[:, :, column] * scale.T).ravel()
         missing = np.isnan(x)
         if missing.any():

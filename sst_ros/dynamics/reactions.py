@@ -489,6 +489,7 @@ class _Leg(NamedTuple):
         )
         drive = scene.actuated_links[k]
         drive_needs = _link_needs(drive, inertia, first, drive_turning)
+        # t.m, r.(m + B) and w.(m + B + A) are known, see above.
         at_gamma, at_mu, at_beta = loads
         needs = link_needs.moment
         along_t = -at_beta

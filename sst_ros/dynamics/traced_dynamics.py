@@ -443,7 +443,7 @@ class ParametricModel:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the scenarios: programs are traced again."""
-        return _make_model, (self._scenarios, self.profile)
+        return partial(ParametricModel, profile=self.profile), (self._scenarios,)
 
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
         """Return the numbers of scenarios.
@@ -575,7 +575,3 @@ def _check_limit(scenarios: Scenarios, torque: SineTorque, limit: Array) -> Chec
         key = f"scenario {row}: {key}"
     requirement = f"must not be less than the amplitude {largest[row]} of the profile"
     return key, float(limits[row]), bool(largest[row] <= limits[row]), requirement
-
-
-def _make_model(scenarios: Scenarios, profile: bool) -> ParametricModel:
-    return ParametricModel(scenarios, profile=profile)

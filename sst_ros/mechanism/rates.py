@@ -218,7 +218,6 @@ def orientation_sensitivity(
     if gamma is None:
         gamma, _, _ = kinematics.inverse(geometry, matrix)
     angles = np.asarray(gamma, dtype=float)
-    v = geometry.v
     w = geometry.w
     r = kinematics.carriage_directions(geometry, angles)
     t = kinematics.star_axes(geometry, matrix)
@@ -235,18 +234,8 @@ def orientation_sensitivity(
         cosine = np.cos(angles[..., k, None])
         by_gamma[..., k, k] = _dot(np.cross(w[k], r_k), t_k)
         for leg in (k, following):
-            for axis, direction in enumerate(np.eye(3)):
-                # v stays a unit vector: its change is across itself.
-                moved_v = direction - v[leg] * v[leg][axis]
-                if leg == k:
-                    moved_v_k = moved_v
-                    moved_normal = cross(moved_v, v[following])
-                else:
-                    moved_v_k = np.zeros(3)
-                    moved_normal = cross(v[k], moved_v)
-                across_w = moved_normal - w[k] * (w[k] @ moved_normal)
-                moved_w = across_w / np.sin(geometry.arc[k])
-                moved_across = cross(moved_w, v[k]) + cross(w[k], moved_v_k)
+            for axis in range(3):
+                moved_v_k, moved_across = _move_arc(geometry, k, following, leg, axis)
                 moved_r = cosine * moved_v_k + sine * moved_across
                 by_v[..., k, leg, axis] = _dot(moved_r, t_k)
         turn = turns[k]
@@ -264,6 +253,27 @@ def orientation_sensitivity(
         v=of_v.reshape(*shape, 3, 3, 3),
         alpha=by_residual @ by_alpha,
     )
+
+
+def _move_arc(
+    geometry: Geometry, k: int, following: int, leg: int, axis: int
+) -> tuple[Array, Array]:
+    """Differentiate v_k and w_k x v_k by a component of v of a leg, k or the following.
+
+    v stays a unit vector: its change is across itself.
+    """
+    v = geometry.v
+    w = geometry.w
+    moved_v = np.eye(3)[axis] - v[leg] * v[leg][axis]
+    if leg == k:
+        moved_v_k = moved_v
+        moved_normal = cross(moved_v, v[following])
+    else:
+        moved_v_k = np.zeros(3)
+        moved_normal = cross(v[k], moved_v)
+    across_w = moved_normal - w[k] * (w[k] @ moved_normal)
+    moved_w = across_w / np.sin(geometry.arc[k])
+    return moved_v_k, cross(moved_w, v[k]) + cross(w[k], moved_v_k)
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -22,8 +22,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from sst_ros.control.controller import Measurement, TrackingMetrics
-from sst_ros.control.law import Command
+from sst_ros.control.controller import TrackingMetrics
+from sst_ros.control.law import Command, Measurement
 from sst_ros.errors import SstError
 from sst_ros.nodes import topics
 from sst_ros.nodes.answering import AnsweringWorker

@@ -48,10 +48,13 @@ from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, V
 
 LOG_NS = 50_000_000
 """Torques are published once for about this time, not with each sample."""
-_HISTORY_S = 2  # of messages that are kept for slow readers
-_FAST = 10  # real-time factor that the history of a run without deadlines is made for
+_HISTORY_S = 2
+"""Time of which messages are kept for slow readers."""
+_FAST = 10
+"""Real-time factor that the history of a run without deadlines is made for."""
 _LEAST_DEPTH = 10
 _MOST_DEPTH = 20_000
+"""Messages that are kept at least, and at most: they take memory."""
 _AT_REST = (0.0,) * len(JOINTS)
 _PASSIVE = (0.0,) * len(PASSIVE_JOINTS)
 _SENSORS = ("imu", "reaction")
@@ -246,9 +249,7 @@ class SimulatorTopics:
         self._phase = own["phase"].publisher(node)
         own["scene"].publisher(node).publish(String(data=dump(scene)))
         if settings.publish_description:
-            mounts = {settings.imu_frame: settings.imu_position} if settings.imu else {}
-            document = String(data=urdf(scene, mounts=mounts))
-            own["robot_description"].publisher(node).publish(document)
+            _publish_description(node, scene, settings)
         self.diagnostics = own["diagnostics"].publisher(node)
         self._awaited = self._find_awaited(settings)
         if self._clock is not None:
@@ -279,20 +280,12 @@ class SimulatorTopics:
         unknown = [name for name in names if name not in publishers]
         listed = ", ".join(sorted(publishers))
         follows = self._clock is not None and follows_clock(self._node)
+        published = f"must be topics that the node publishes: {listed}"
+        no_source = "a node with use_sim_time follows /clock and cannot be its source"
         refuse_unless(
             self._node.get_fully_qualified_name(),
-            (
-                "wait_for_subscribers",
-                unknown,
-                not unknown,
-                f"must be topics that the node publishes: {listed}",
-            ),
-            (
-                "publish_clock",
-                True,
-                not follows,
-                "a node with use_sim_time follows /clock and cannot be its source",
-            ),
+            ("wait_for_subscribers", unknown, not unknown, published),
+            ("publish_clock", True, not follows, no_source),
         )
         return [publishers[name] for name in names]
 
@@ -408,6 +401,17 @@ class SimulatorTopics:
             if publisher.get_subscription_count()
         }
         self._are_torques_read = self._torques.get_subscription_count() > 0
+
+
+def _publish_description(
+    node: Node, scene: Scene, settings: SimulatorParameters
+) -> None:
+    """Publish the scene as URDF, with the frame of the IMU where there is one."""
+    mounts: dict[str, Vector3] = {}
+    if settings.imu:
+        mounts[settings.imu_frame] = settings.imu_position
+    document = String(data=urdf(scene, mounts=mounts))
+    topics.SIMULATOR["robot_description"].publisher(node).publish(document)
 
 
 def _history_depth(settings: SimulatorParameters) -> int:

@@ -26,10 +26,17 @@ def handle() -> None:
 
 
 def interrupt(*, at_once: bool) -> None:
-    """Have an unhandled SIGINT end the process at once, or raise KeyboardInterrupt."""
-    usual = signal.SIG_DFL, signal.default_int_handler
-    if signal.getsignal(signal.SIGINT) in usual:  # not ignored, as behind a shell's `&`
-        signal.signal(signal.SIGINT, usual[not at_once])
+    """Have an unhandled SIGINT end the process at once, or raise KeyboardInterrupt.
+
+    One that is ignored stays so, as behind a shell's `&`.
+    """
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    if signal.getsignal(signal.SIGINT) not in usual:
+        return
+    if at_once:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    else:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def ignore() -> None:

@@ -8,9 +8,9 @@ projection of Lambert, so that equal patches are equal solid angles.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -42,6 +42,8 @@ if TYPE_CHECKING:  # the room needs python-flint
 
 CONDITIONS = (1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)
 """Levels of cond J; all above them have one colour."""
+PLATEAU = 0.01
+"""Values that are off the best one by this share of it count as the best, too."""
 _ALARM = "#d1182b"
 ZONE_DIVISIONS = 50
 """Divisions of an edge of the triangle on which a zone is drawn."""
@@ -85,13 +87,12 @@ def _draw_row(row: Any, chart: OrientationMap, title: str) -> None:
     turn = np.where(chart.turn > 0.0, np.degrees(chart.turn), np.nan)
     margin = np.degrees(chart.best_margin)
     turn_axes, condition_axes, margin_axes = row.subplots(1, 3)
-    for axes, name, values in (
-        (turn_axes, "Free turn of the star about OE", turn),
-        (condition_axes, "Best condition of J over that turn", chart.best_cond_j),
-        (margin_axes, "Distance to the nearest limit, best turn", margin),
-    ):
-        _panel(axes, chart, faces, values, condition=axes is condition_axes)
-        axes.set_title(name, fontsize=10.5, color=INK, loc="center")
+    _panel(turn_axes, chart, faces, turn, _angle_scale)
+    _set_title(turn_axes, "Free turn of the star about OE")
+    _panel(condition_axes, chart, faces, chart.best_cond_j, _condition_scale)
+    _set_title(condition_axes, "Best condition of J over that turn")
+    _panel(margin_axes, chart, faces, margin, _angle_scale)
+    _set_title(margin_axes, "Distance to the nearest limit, best turn")
     poses = workspace.parallel_singularities(chart)
     ends = workspace.serial_singularities(chart.geometry)
     for singular, marker, size, colour, label in (
@@ -141,7 +142,7 @@ def plot_zone(zone: ProvenZone) -> Figure:
             ),
         ):
             _draw_torsion(axes, mesh, torsion)
-            axes.set_title(title, fontsize=10.5, color=INK, loc="center")
+            _set_title(axes, title)
             draw_triangle(axes, geometry)
     figure.suptitle(f"{zone.scene.name}: {zone.shares}", fontsize=12, color=INK)
     return figure
@@ -180,48 +181,65 @@ def triangles(chart: OrientationMap) -> NDArray[np.intp]:
     return faces
 
 
+class _Scale(NamedTuple):
+    """How the values of a map are drawn, and which of them is the best."""
+
+    label: str
+    levels: Sequence[float] | Array
+    looks: Looks
+    best: float
+    best_text: str
+
+
+def _angle_scale(degrees: Array) -> _Scale:
+    """Return the scale of angles [deg], of which the largest is the best."""
+    best = float(np.nanmax(degrees))
+    levels = MaxNLocator(10).tick_values(0.0, best)
+    return _Scale("deg", levels, {"cmap": "viridis"}, best, f"most {best:.0f}°")
+
+
+def _condition_scale(conditions: Array) -> _Scale:
+    """Return the scale of cond J, logarithmic from 1; the least is the best."""
+    best = float(np.nanmin(conditions))
+    norm = LogNorm(1.0, CONDITIONS[-1])
+    looks: Looks = {"cmap": "magma_r", "norm": norm, "extend": "max"}
+    return _Scale("cond J", CONDITIONS, looks, best, f"least {best:.2f}")
+
+
+def _set_title(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10.5, color=INK, loc="center")
+
+
 def _panel(
     axes: Axes,
     chart: OrientationMap,
     faces: NDArray[np.intp],
     values: Array,
-    *,
-    condition: bool,
+    scale_of: Callable[[Array], _Scale],
 ) -> None:
-    """Draw values (n,): angles [deg], or cond J.
-
-    The scale of cond J is logarithmic, from 1, and the least is the best.
-    """
+    """Draw values at the directions of a map, shape (n,), and mark the best place."""
     x, y = project(chart.geometry, chart.s)
     axes.tripcolor(Triangulation(x, y, faces), 0.0 * x, cmap="Greys", vmin=-0.5, vmax=5)
     finite = np.isfinite(values)
     inside = finite[faces].all(axis=1)
     if inside.any():
-        best_value = float(np.nanmin(values) if condition else np.nanmax(values))
-        levels: Any = CONDITIONS
-        looks: Looks = {
-            "cmap": "magma_r",
-            "norm": LogNorm(1.0, CONDITIONS[-1]),
-            "extend": "max",
-        }
-        if not condition:
-            levels = MaxNLocator(10).tick_values(0.0, best_value)
-            looks = {"cmap": "viridis"}
+        scale = scale_of(values)
         mesh = Triangulation(x, y, faces, mask=~inside)
-        shown_values = np.where(finite, values, best_value)
-        filled = axes.tricontourf(mesh, shown_values, levels=levels, **looks)
-        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.72, pad=0.02, ticks=levels)
-        bar.set_label("cond J" if condition else "deg", fontsize=9)
+        filled_values = np.where(finite, values, scale.best)
+        filled = axes.tricontourf(
+            mesh, filled_values, levels=scale.levels, **scale.looks
+        )
+        bar = axes.figure.colorbar(
+            filled, ax=axes, shrink=0.72, pad=0.02, ticks=scale.levels
+        )
+        bar.set_label(scale.label, fontsize=9)
         bar.ax.tick_params(labelsize=8)
-        bar.ax.set_yticklabels([f"{level:g}" for level in levels])
+        bar.ax.set_yticklabels([f"{level:g}" for level in scale.levels])
         bar.ax.minorticks_off()
         # On a plateau the place that is farthest from the limits.
-        plateau = np.abs(values - best_value) <= 0.01 * abs(best_value)
+        plateau = np.abs(values - scale.best) <= PLATEAU * abs(scale.best)
         best = int(np.nanargmax(np.where(plateau, chart.best_margin, np.nan)))
-        text = f"most {best_value:.0f}°"
-        if condition:
-            text = f"least {best_value:.2f}"
-        _mark_best(axes, x[best], y[best], text)
+        _mark_best(axes, x[best], y[best], scale.best_text)
     draw_triangle(axes, chart.geometry)
 
 
@@ -305,7 +323,7 @@ def draw_paths(scene: Scene, paths: Sequence[tuple[str, Array, Looks]]) -> Figur
     axes = figure.subplots()
     chart = _map(scene)
     margin = np.degrees(chart.best_margin)
-    _panel(axes, chart, triangles(chart), margin, condition=False)
+    _panel(axes, chart, triangles(chart), margin, _angle_scale)
     for name, s, looks in paths:
         x, y = project(chart.geometry, s)
         axes.plot(x, y, color="white", linewidth=4.0, zorder=1.9)  # seen on each colour

@@ -406,6 +406,32 @@ def _spread_early(early: int, lanes: int) -> list[str]:
     return lines
 
 
+def _read_columns(i: int, lanes: int) -> list[str]:
+    """Lines of `_write_loop` that copy columns of a row to input i of the body."""
+    vector_type = _type_of(lanes)
+    array = _pointer(vector_type)
+    return [
+        _element(f"%l{i}.a", "double", f"%r{i}", "%k"),
+        f"  %l{i}.v = bitcast double* %l{i}.a to {array}",
+        f"  %l{i} = load {vector_type}, {array} %l{i}.v, align 8",
+        _element(f"%x{i}", vector_type, "%x", i),
+        f"  store {vector_type} %l{i}, {array} %x{i}, align 8",
+    ]
+
+
+def _write_columns(i: int, lanes: int) -> list[str]:
+    """Lines of `_write_loop` that copy output i of the body to columns of a row."""
+    vector_type = _type_of(lanes)
+    array = _pointer(vector_type)
+    return [
+        _element(f"%o{i}.a", vector_type, "%o", i),
+        f"  %o{i} = load {vector_type}, {array} %o{i}.a, align 8",
+        _element(f"%t{i}", "double", f"%w{i}", "%k"),
+        f"  %t{i}.v = bitcast double* %t{i} to {array}",
+        f"  store {vector_type} %o{i}, {array} %t{i}.v, align 8",
+    ]
+
+
 def _write_loop(
     name: str, early: int, program: Program, shared: int, lanes: int
 ) -> str:
@@ -447,19 +473,11 @@ def _write_loop(
         "  %k = phi i64 [0, %entry], [%next, %loop]",
     ]
     for i in range(early, count):
-        lines.append(_element(f"%l{i}.a", "double", f"%r{i}", "%k"))
-        lines.append(f"  %l{i}.v = bitcast double* %l{i}.a to {array}")
-        lines.append(f"  %l{i} = load {vector_type}, {array} %l{i}.v, align 8")
-        lines.append(_element(f"%x{i}", vector_type, "%x", i))
-        lines.append(f"  store {vector_type} %l{i}, {array} %x{i}, align 8")
+        lines += _read_columns(i, lanes)
     call = _function_name(_body(name), lanes)
     lines.append(f"  call void {call}({array} %x, double* %p, {array} %o)")
     for i in range(len(program.outputs)):
-        lines.append(_element(f"%o{i}.a", vector_type, "%o", i))
-        lines.append(f"  %o{i} = load {vector_type}, {array} %o{i}.a, align 8")
-        lines.append(_element(f"%t{i}", "double", f"%w{i}", "%k"))
-        lines.append(f"  %t{i}.v = bitcast double* %t{i} to {array}")
-        lines.append(f"  store {vector_type} %o{i}, {array} %t{i}.v, align 8")
+        lines += _write_columns(i, lanes)
     lines += [
         f"  %next = add i64 %k, {lanes}",
         "  %more = icmp slt i64 %next, %n",

@@ -11,23 +11,24 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from typing import Any
 
 from sst_ros.errors import refuse_other_rounding, require
 
 _flint = require("flint")
-arb, arb_mat, arb_poly, arb_series, ctx = (
-    getattr(_flint, name)
-    for name in ("arb", "arb_mat", "arb_poly", "arb_series", "ctx")
-)
+arb = _flint.arb
+arb_mat = _flint.arb_mat
+arb_poly = _flint.arb_poly
+arb_series = _flint.arb_series
+ctx = _flint.ctx
 
 PRECISION = 128  # bits of all balls
 LONGEST_SERIES = 100  # coefficients of a series, at most
 PERCENT = 2  # exponent of ten
+# python-flint has one context for all threads, so one proof runs at a time.
 _CONTEXT_LOCK = threading.RLock()
-"""python-flint has one context for all threads, so one proof runs at a time."""
 
 
 @contextlib.contextmanager
@@ -39,19 +40,22 @@ def precision() -> Iterator[None]:
     """
     refuse_other_rounding("certify")
     with _CONTEXT_LOCK:
-        before = ctx.prec, ctx.cap
-        ctx.prec, ctx.cap = PRECISION, LONGEST_SERIES
+        old_precision = ctx.prec
+        old_cap = ctx.cap
+        ctx.prec = PRECISION
+        ctx.cap = LONGEST_SERIES
         try:
             yield
         finally:
-            ctx.prec, ctx.cap = before
+            ctx.prec = old_precision
+            ctx.cap = old_cap
 
 
 def number_ball(number: float, text: str | None = None) -> Any:
     """Return a ball of a number as it is read and as it is written.
 
-    Reading rounds to nearest, so the two are half a unit in the last place apart at
-    most.
+    Reading rounds to nearest, so the two are at most half a unit in the last place
+    apart.
     """
     if Decimal(text or repr(number)) == Decimal(number):
         return arb(number)
@@ -78,41 +82,44 @@ def lower(x: Any) -> float:
 
 
 def write_up(number: float, digits: int = 2) -> str:
-    """Write a bound with some significant digits, none of them less than it."""
+    """Write a number to some significant digits, rounded up."""
     return _write(number, digits, ROUND_CEILING)
 
 
 def write_down(number: float, digits: int = 12) -> str:
-    """Write a number with some significant digits, none of them greater than it."""
+    """Write a number to some significant digits, rounded down."""
     return _write(number, digits, ROUND_FLOOR)
 
 
 def percent_up(share: float, digits: int) -> str:
-    """Write a share in percent, not less than it."""
+    """Write a share in percent, rounded up."""
     return f"{_write(share, digits, ROUND_CEILING, PERCENT)} %"
 
 
 def percent_down(share: float, digits: int) -> str:
-    """Write a share in percent, not greater than it."""
+    """Write a share in percent, rounded down."""
     return f"{_write(share, digits, ROUND_FLOOR, PERCENT)} %"
 
 
 def degrees_up(angle: float, digits: int) -> str:
-    """Write an angle [rad] in degrees, not less than it."""
+    """Write an angle [rad] in degrees, rounded up."""
     with precision():
         return f"{write_up(upper(arb(angle) * 180 / arb.pi()), digits)} deg"
 
 
 def _write(number: float, digits: int, rounding: str, exponent: int = 0) -> str:
-    """Write a number times ten to an exponent; it is rounded once."""
+    """Write number * 10**exponent to some significant digits, rounded once."""
     if not math.isfinite(number):
         return str(number)
     rounded = Context(prec=digits, rounding=rounding).create_decimal(Decimal(number))
     if exponent:
-        rounded = rounded.scaleb(exponent) + 0  # exact; 100, not 1E+2
+        # Both operations are exact. Adding 0 makes 100 out of 1E+2.
+        rounded = rounded.scaleb(exponent) + 0
     text = f"{rounded:.{digits}g}"
     assert Decimal(text) == rounded
-    return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+    if "." in text and "e" not in text:
+        text = text.rstrip("0").rstrip(".")
+    return text
 
 
 def between(low: Any, high: Any) -> Any:
@@ -120,20 +127,63 @@ def between(low: Any, high: Any) -> Any:
     return arb(low).union(arb(high))
 
 
+def around_zero(bounds: Iterable[Any]) -> list[Any]:
+    """Return the balls of all numbers whose absolute values have upper bounds."""
+    return [arb(0, bound.upper()) for bound in bounds]
+
+
+def middles(numbers: Iterable[Any]) -> list[Any]:
+    """Return the middles of balls, as exact numbers."""
+    return [x.mid() for x in numbers]
+
+
+def radii(numbers: Iterable[Any]) -> list[Any]:
+    """Return the radii of balls, as exact numbers."""
+    return [x.rad() for x in numbers]
+
+
 def norm(numbers: Sequence[Any]) -> Any:
     """Return the root of the sum of squares.
 
     The ball of a sum that may be zero has negative numbers, too, which have no root.
     """
-    total = sum((x * x for x in numbers), arb(0))
+    total = inner_product(numbers, numbers)
     if total > 0:
         return total.sqrt()
     return between(0, total.upper().max(arb(0)).sqrt())
 
 
+def inner_product(left: Sequence[Any], right: Sequence[Any]) -> Any:
+    """Return the sum of the products of two rows of numbers."""
+    total = arb(0)
+    for x, y in zip(left, right, strict=True):
+        total = total + x * y
+    return total
+
+
+def rows_of(numbers: Sequence[Any], size: int) -> list[Any]:
+    """Divide numbers into rows of `size` numbers."""
+    return [numbers[k : k + size] for k in range(0, len(numbers), size)]
+
+
 def column(numbers: Sequence[Any]) -> Any:
     """Return a matrix of one column."""
     return arb_mat([[x] for x in numbers])
+
+
+def from_columns(columns: Sequence[Sequence[Any]]) -> Any:
+    """Return a matrix of columns."""
+    return arb_mat([list(row) for row in zip(*columns, strict=True)])
+
+
+def identity(n: int) -> Any:
+    """Return the identity matrix of n rows."""
+    return zeros(n) + 1
+
+
+def zeros(n: int) -> Any:
+    """Return the matrix of n rows and n columns of zeros."""
+    return arb_mat(n, n, [0] * (n * n))
 
 
 def magnitude(matrix: Any) -> Any:
@@ -143,4 +193,5 @@ def magnitude(matrix: Any) -> Any:
 
 def entries(matrix: Any) -> list[Any]:
     """Return the numbers of a matrix, row by row."""
-    return [x for row in matrix.tolist() for x in row]
+    numbers: list[Any] = matrix.entries()
+    return numbers

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import copy
 import math
-import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,8 +28,10 @@ from sst_ros.dynamics.initial_state import start_of
 from sst_ros.dynamics.model import Limit, limits_of
 from sst_ros.dynamics.motion_table import JOINT_QUANTITIES
 from sst_ros.dynamics.traced_dynamics import (
+    LEGS,
     MOTION,
     RATE_SYMBOLS,
+    STATE_SIZE,
     TORQUE_SYMBOLS,
     Dynamics,
 )
@@ -50,6 +52,7 @@ from sst_ros.mechanism.generic_math import (
     triple,
 )
 from sst_ros.mechanism.geometry import Array, Geometry
+from sst_ros.programs.expression import divide
 from sst_ros.progress import Bar
 from sst_ros.proof import enclosure
 from sst_ros.proof.balls import (
@@ -57,8 +60,11 @@ from sst_ros.proof.balls import (
     arb_mat,
     arb_poly,
     between,
+    from_columns,
+    inner_product,
     norm,
     precision,
+    rows_of,
     upper,
     write_down,
     write_up,
@@ -83,36 +89,76 @@ from sst_ros.scene.torque_profile import (
 )
 from sst_ros.simulation.simulate import simulate
 from sst_ros.simulation.trajectory import Trajectory
-from sst_ros.state import NANOSECONDS, Explained, cached_property
+from sst_ros.state import (
+    NANOSECONDS,
+    QUATERNION,
+    STAR,
+    STAR_RATE,
+    Explained,
+    cached_property,
+)
 
-# begin, end, sign of a number in between; 0 where not known
-Span = tuple[float, float, int]
 PARALLEL = "parallel singularity, det J2 = 0"
-LIMIT_ORDER = 6  # of expansions whose signs say where limits are
-SPLITS = 200  # of a step, most of them near a limit
-TURN_SPLITS = 80  # of a step in which a joint may turn back: a joint may be at rest
-TURN_SYMBOLS = ("turn_x", "turn_y", "turn_z")
-GAMMA_SYMBOLS = ("g1", "g2", "g3")
-ANGLE_RATES = ("gd1", "gd2", "gd3")
-_UNIT_QUATERNIONS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 KNOWN_TORQUES = "must be numbers, sines, a table, polynomials or a Controller"
 AT_START = "the posture at the start is not proven to be the only one near"
 MOST_BOX_PARTS = 10_000  # of the box of ranges
-ORDER = -1.6
+
+# The start, see `_start_equations`: unknowns, and what is given of the actuators.
+TURN_SYMBOLS = ("turn_x", "turn_y", "turn_z")
+GAMMA_SYMBOLS = ("g1", "g2", "g3")
+ANGLE_RATES = ("gd1", "gd2", "gd3")
+_UNKNOWN_SIZES = {"turn": len(TURN_SYMBOLS), "body_rate": len(RATE_SYMBOLS)}
+_START_SIZES = {**_UNKNOWN_SIZES, "gamma": LEGS, "gamma_dot": LEGS}
+_UNIT_TURNS = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+
+ANGLES_AND_RATES = len(JOINT_QUANTITIES) * LEGS  # numbers of all joints
+
+# Choice of steps: it decides how long a proof takes, not what is true.
+ORDER_PER_DIGIT = 1.6  # order of p over the digits of the tolerance, rounded up
+LEAST_ORDER = 14  # of p
+FIRST_TOLERANCE = 1e-6  # of a step, as a share of the bound
 PROOF_ATTEMPTS = 3  # proofs of a motion, each at a smaller tolerance
-# how often ranges are halved where a width is looked for that would do; then bisected
+NEXT_TOLERANCE = 0.1  # of the next proof, as a share of what would just do
+
+# Signs that say when a limit may be met.
+LIMIT_ORDER = 6  # of expansions of the numbers
+SPLITS = 200  # of a step, most of them near a limit
+TURN_SPLITS = 80  # of a step in which a joint may turn back: a joint may be at rest
+SHORTEST_SPAN = 1e-10  # of a step: it is not split, whatever is known of its signs
+
+# Search for narrower ranges that would do: they are halved so often, then bisected.
 HALVINGS = (1, 2, 4, 8, 16, 32)
 SHARE_DIGITS = 3  # of a share of a width that would do
-# most steps of a proof with narrower ranges: so many times those without, and some
+# Most steps of a proof with narrower ranges: so many times those without, and some.
 NARROW_STEPS = 4
 SPARE_STEPS = 10
-JOINT_COUNT = 18  # angles and rates of the joints
+
+
+class SignSpan(NamedTuple):
+    """A span of time [s], and the sign of a number in it; 0 where it is not known."""
+
+    begin: float
+    end: float
+    sign: int
+
+
+class _StartSet(NamedTuple):
+    """How the unknowns of the start depend on the numbers of the first region.
+
+    An unknown is that at the middle, its row times numbers within the radii, and what
+    the readings leave out.
+    """
+
+    rows: list[list[Any]]  # by unknown
+    radii: list[Any]
+    reading_errors: list[Any]  # by unknown
 
 
 class BallEquations:
     """The motion of a scene on balls.
 
-    The state has the numbers that are ranges at the end.
+    The state y has that of the dynamics, what a controller changes at ticks, and the
+    numbers that are ranges.
     """
 
     def __init__(
@@ -133,22 +179,25 @@ class BallEquations:
             self.loop = SampledLoop(control, self.balls, self.state)
             self._tick_inputs = (*TORQUE_SYMBOLS, *self.loop.memory)
         self.inputs = (*self.state, *self._tick_inputs, *self.balls.inputs)
+        # Inputs of compiled functions, before the numbers that are ranges.
+        commands = self._tick_inputs or TORQUE_SYMBOLS
+        self._function_inputs = ("t", *self.state, *commands)
+        self._sizes = {"state": len(self.state), "command": LEGS}
 
     def start(self) -> Region:
         """Enclose the start by Krawczyk's test.
 
-        Refused: it is not proven to be the only one.
-
         Unknown are a small turn from the orientation that `simulate` begins with, and
         the body rate; the set keeps how they depend on gamma, gamma_dot and the numbers
-        that are ranges.
+        that are ranges. Raises Refused where the start is not proven to be the only one
+        near.
         """
-        x, y, z, w, *rate = start_of(self.scene)[:7]
-        unknown = (*TURN_SYMBOLS, *RATE_SYMBOLS)
-        initial = (*GAMMA_SYMBOLS, *ANGLE_RATES)
-        by = (*unknown, *initial, *self.balls.inputs)
-        equations = _start_equations((x, y, z, w))
-        run = self.balls.compile(equations, (*unknown, *initial), by)
+        x, y, z, w, *body_rate = start_of(self.scene)[STAR]
+        orientation = (x, y, z, w)
+        inputs = (*TURN_SYMBOLS, *RATE_SYMBOLS, *GAMMA_SYMBOLS, *ANGLE_RATES)
+        run = self.balls.compile(
+            _start_equations(orientation), inputs, (*inputs, *self.balls.inputs)
+        )
         initial_numbers = [
             *self.balls.initial("gamma"),
             *self.balls.initial("gamma_dot"),
@@ -158,81 +207,87 @@ class BallEquations:
             is_reading = isinstance(number, NumberReading)
             parameters.append(number.ball if is_reading else number)
         parameters += self.balls.varied_balls
-        root = krawczyk(run, [0.0, 0.0, 0.0, *rate], parameters, AT_START)
-        size = len(self.state)
-        n = size + len(self.balls.inputs)
-        by_column, radii, reading_errors = self._columns_of_start(
-            root, initial_numbers, parameters
-        )
-        remainder = [
-            x + reading_error
-            for x, reading_error in zip(root.remainder, reading_errors, strict=True)
-        ]
-        # q is linear in the turn.
-        units = [quaternion_product((x, y, z, w), unit) for unit in _UNIT_QUATERNIONS]
-        slopes = []
-        errors = [arb(0)] * n
-        for i in range(4):
-            quaternion_slopes = [arb(units[k][i]) for k in range(3)]
-            rows = zip(*by_column[:3], strict=True)
-            slopes.append(
-                [sum(map(operator.mul, quaternion_slopes, row), arb(0)) for row in rows]
-            )
-            errors[i] = sum(
-                (
-                    abs(a) * b
-                    for a, b in zip(quaternion_slopes, remainder[:3], strict=True)
-                ),
-                arb(0),
-            )
-        slopes += by_column[3:]
-        errors[4:7] = remainder[3:]
-        for place in range(len(slopes), n):
-            row = [arb(0)] * n
-            row[place] = arb(int(place >= size))
-            slopes.append(row)
-        turned = quaternion_product((x, y, z, w), (*root.middle[:3], arb(1)))
-        lagged = [arb(0)] * (size - len(MOTION))
-        varied = [arb(ball.mid()) for ball in parameters[len(initial) :]]
-        centre = [*turned, *root.middle[3:], *lagged, *varied]
-        region = Region.linear(0.0, centre, arb_mat(slopes), radii, errors, n - size)
+        root = krawczyk(run, [0.0, 0.0, 0.0, *body_rate], parameters, AT_START)
+        start_set = self._start_set(root, initial_numbers, parameters)
+        region = self._start_region(orientation, root, start_set)
         return region if self.loop is None else self.loop.begin(region)
 
-    def _columns_of_start(
-        self, root: Root, initial_numbers: Sequence[Any], parameters: Sequence[Any]
-    ) -> tuple[list[list[Any]], list[Any], list[Any]]:
-        """Return how the root depends on the numbers of the set, column by column.
+    def _start_region(
+        self, orientation: Quadruple, root: Root, start_set: _StartSet
+    ) -> Region:
+        """Return the region of all starts: the quaternion is linear in the turn."""
+        remainder = [
+            bound + reading_error
+            for bound, reading_error in zip(
+                root.remainder, start_set.reading_errors, strict=True
+            )
+        ]
+        rows = divide(_UNKNOWN_SIZES, start_set.rows)
+        errors = divide(_UNKNOWN_SIZES, remainder)
+        middle = divide(_UNKNOWN_SIZES, root.middle)
+        by_turn = zip(
+            *(quaternion_product(orientation, unit) for unit in _UNIT_TURNS),
+            strict=True,
+        )
+        region_rows = []
+        region_errors = []
+        for component_slopes in by_turn:
+            slopes = [arb(slope) for slope in component_slopes]
+            columns = zip(*rows["turn"], strict=True)
+            region_rows.append([inner_product(slopes, numbers) for numbers in columns])
+            sizes = [abs(slope) for slope in slopes]
+            region_errors.append(inner_product(sizes, errors["turn"]))
+        region_rows += rows["body_rate"]
+        region_errors += errors["body_rate"]
+        size = len(self.state)
+        n = size + len(self.balls.inputs)
+        for place in range(len(region_rows), n):
+            row = [arb(0)] * n
+            if place >= size:  # a range; lagged torques are zero at the start
+                row[place] = arb(1)
+            region_rows.append(row)
+            region_errors.append(arb(0))
+        turned = quaternion_product(orientation, (*middle["turn"], arb(1)))
+        lagged = [arb(0)] * (size - STATE_SIZE)
+        varied = [arb(ball.mid()) for ball in self.balls.varied_balls]
+        centre = [*turned, *middle["body_rate"], *lagged, *varied]
+        c = arb_mat(region_rows)
+        return Region.linear(
+            0.0, centre, c, start_set.radii, region_errors, fixed=n - size
+        )
 
-        The radii of the columns follow, then bounds of what the readings leave out.
+    def _start_set(
+        self, root: Root, initial_numbers: Sequence[Any], parameters: Sequence[Any]
+    ) -> _StartSet:
+        """Return how the root depends on the numbers of the first region.
+
+        A range of an initial number takes the column of a number of the state, which
+        has no use of its own at the start. How numbers are read, and all other ranges,
+        have the columns of their inputs.
         """
         size = len(self.state)
         n = size + len(self.balls.inputs)
-        # Columns of the set: a range of an initial number has one, in place of a number
-        # of the state; how numbers are read, and all other ranges, have that of their
-        # own input.
-        by_column = [[arb(0)] * n for _ in root.middle]
-        reading_errors = [arb(0)] * len(root.middle)
-        radii = [arb(0)] * n
+        unknowns = range(len(root.middle))
+        rows = [[arb(0)] * n for _ in unknowns]
+        reading_errors = [arb(0)] * len(unknowns)
+        column_radii = [arb(0)] * n
         for j, ball in enumerate(parameters):
-            reading = None
-            if j < len(initial_numbers):
-                reading = initial_numbers[j]
-                place = j
-            else:
-                place = size + j - len(initial_numbers)
+            is_initial = j < len(initial_numbers)
+            place = j if is_initial else size + j - len(initial_numbers)
             factor = arb(1)
             radius = ball.rad()
-            if isinstance(reading, NumberReading):
-                place = n - 1
+            if is_initial and isinstance(initial_numbers[j], NumberReading):
+                reading = initial_numbers[j]
+                place = n - 1  # the input READING
                 factor = reading.half
                 radius = arb(0)
                 missing = abs(reading.middle - ball.mid())
-                for i in range(len(root.middle)):
+                for i in unknowns:
                     reading_errors[i] += abs(root.slopes[i, j]) * missing
-            for i in range(len(root.middle)):
-                by_column[i][place] += root.slopes[i, j] * factor
-            radii[place] = arb.max(radii[place], radius)
-        return by_column, radii, reading_errors
+            for i in unknowns:
+                rows[i][place] += root.slopes[i, j] * factor
+            column_radii[place] = arb.max(column_radii[place], radius)
+        return _StartSet(rows, column_radii, reading_errors)
 
     def _unlimited(
         self, traced_scene: Parts, time: Any, command: Sequence[Any]
@@ -241,8 +296,15 @@ class BallEquations:
         if not isinstance(self._profile, SineTorque):
             return list(command)
         sine = traced_scene.scene.torque
-        rows = zip(sine.amplitude, sine.frequency, sine.phase, strict=True)
-        return [a * gm.sin(f * time + phase) if a else 0.0 for a, f, phase in rows]
+        torques = []
+        for amplitude, frequency, phase in zip(
+            sine.amplitude, sine.frequency, sine.phase, strict=True
+        ):
+            torque: Any = 0.0
+            if amplitude:
+                torque = amplitude * gm.sin(frequency * time + phase)
+            torques.append(torque)
+        return torques
 
     def _acting(
         self, traced_scene: Parts, time: Any, command: Sequence[Any]
@@ -253,7 +315,8 @@ class BallEquations:
         if limit is None:
             return torques
         return [
-            limit - gm.positive(2.0 * limit - gm.positive(x + limit)) for x in torques
+            limit - gm.positive(2.0 * limit - gm.positive(torque + limit))
+            for torque in torques
         ]
 
     @cached_property
@@ -262,20 +325,19 @@ class BallEquations:
 
         Both are functions of time, state, commands and varied numbers.
         """
-        size = len(self.state)
+        held_count = len(self.inputs) - len(self.state)
 
         def derivative(traced_scene: Parts, time: Any, *state_and_commands: Any) -> Any:
-            torque = self._acting(
-                traced_scene, time, state_and_commands[size : size + 3]
-            )
-            slope = kernel.derivative(
-                traced_scene.model, state_and_commands[:size], triple(torque)
-            )
-            return (*slope, *[0.0] * (len(self.inputs) - size))
+            of = divide(self._sizes, state_and_commands)
+            torque = self._acting(traced_scene, time, of["command"])
+            slope = kernel.derivative(traced_scene.model, of["state"], triple(torque))
+            return (*slope, *[0.0] * held_count)
 
-        inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
-        value = self.balls.compile(derivative, inputs)
-        return value, self.balls.compile(derivative, inputs, self.inputs)
+        value = self.balls.compile(derivative, self._function_inputs)
+        with_jacobian = self.balls.compile(
+            derivative, self._function_inputs, self.inputs
+        )
+        return value, with_jacobian
 
     def between(self, begin: float, end: float) -> tuple[Function, Function]:
         """Return the derivative, and the derivative with the Jacobian.
@@ -286,16 +348,13 @@ class BallEquations:
         return self._commanded(value, begin, end), self._commanded(jacobian, begin, end)
 
     def limits_between(self, begin: float, end: float) -> Function:
-        """Return the numbers whose signs are named by `limit_names`.
-
-        They are functions of time and state.
-        """
+        """Return the function of time and state whose signs `limit_names` names."""
         return self._commanded(self._limits, begin, end)
 
     def _commanded(self, function: Function, begin: float, end: float) -> Function:
-        """Return a function of time and state, without commands.
+        """Return a function of time and state, from one that has commands, too.
 
-        The given one has commands after the state.
+        The commands are those of the profile; a controller has its own in the state.
         """
         if self.loop is not None:
             return function
@@ -318,7 +377,7 @@ class BallEquations:
     def joints(self) -> Function:
         """Compile the angles and rates of the joints, and their derivatives.
 
-        The derivatives are by quaternion, W and varied.
+        The derivatives are by quaternion, W and the numbers that are ranges.
         """
 
         def angles_and_rates(traced_scene: Parts, *y: Any) -> list[Any]:
@@ -331,28 +390,27 @@ class BallEquations:
     @cached_property
     def stops(self) -> list[Limit]:
         """Limits of the mechanism, at which the scene may stop or not."""
-        # Of a scene `limits_of` reads these two alone: here as if all limits stop.
-        stop: Any = SimpleNamespace(at_end="stop", at_edge="stop")
-        every: Any = SimpleNamespace(stroke=stop, workspace=stop)
-        return list(limits_of(every, Geometry.of(self.scene)))
+        # `limits_of` reads no more of a scene: here all limits stop.
+        stopping: Any = SimpleNamespace(
+            stroke=SimpleNamespace(at_end="stop"),
+            workspace=SimpleNamespace(at_edge="stop"),
+        )
+        return list(limits_of(stopping, Geometry.of(self.scene)))
 
     @cached_property
     def stop_names(self) -> set[str]:
         """Names of the limits at which the motion ends."""
-        return {
-            limit.reason for limit in limits_of(self.scene, Geometry.of(self.scene))
-        }
+        limits = limits_of(self.scene, Geometry.of(self.scene))
+        return {limit.reason for limit in limits}
 
     @cached_property
     def limit_names(self) -> list[str]:
         """Names of limits: of joints, of singularities, of contacts and of torques."""
         names = [*(limit.reason for limit in self.stops), PARALLEL]
         if self.scene.stroke.at_end == "elastic":
-            names += [
-                f"contact of gamma_{leg} at {end}"
-                for leg in (1, 2, 3)
-                for end in ("0", "arc")
-            ]
+            for leg in (1, 2, 3):
+                names.append(f"contact of gamma_{leg} at 0")
+                names.append(f"contact of gamma_{leg} at arc")
         if self.scene.torque_limit is not None:
             names += [f"torque_{leg} at its limit" for leg in (1, 2, 3)]
         return names
@@ -362,32 +420,29 @@ class BallEquations:
         """Names of the joints with dry friction, where they turn back."""
         return [
             f"{JOINT_QUANTITIES[joint_kind]}_{leg} turns back under dry friction"
-            for joint_kind in self._rubbing
+            for joint_kind in self._dry_joints
             for leg in (1, 2, 3)
         ]
 
     @cached_property
-    def _rubbing(self) -> list[int]:
+    def _dry_joints(self) -> list[int]:
         """Kinds of joints (0 to 2) that have dry friction."""
         friction = self.scene.friction
         if friction is None:
             return []
+        dry_joints = []
         laws = (friction.gamma, friction.mu, friction.beta)
-        return [
-            joint_kind
-            for joint_kind, law in enumerate(laws)
-            if law is not None and (law.coulomb or law.static)
-        ]
+        for joint_kind, law in enumerate(laws):
+            if law is not None and (law.coulomb or law.static):
+                dry_joints.append(joint_kind)
+        return dry_joints
 
     def turns_between(self, begin: float, end: float) -> Function:
-        """Return the rates of the joints that are named by `turn_names`.
-
-        They are functions of time and state.
-        """
-        return self._commanded(self._rubbing_rates, begin, end)
+        """Return the function of time and state whose signs `turn_names` names."""
+        return self._commanded(self._dry_joint_rates, begin, end)
 
     @cached_property
-    def _rubbing_rates(self) -> Function:
+    def _dry_joint_rates(self) -> Function:
         """Compile the rates of the joints with dry friction [rad/s]."""
 
         def rates(
@@ -396,53 +451,59 @@ class BallEquations:
             legs = list(kernel.leg_motions(traced_scene.model, state_and_commands))
             return [
                 kernel.joint_rate(leg, joint_kind)
-                for joint_kind in self._rubbing
+                for joint_kind in self._dry_joints
                 for leg in legs
             ]
 
-        inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
-        return self.balls.compile(rates, inputs)
+        return self.balls.compile(rates, self._function_inputs)
 
     @cached_property
     def _limits(self) -> Function:
         """Compile numbers that are zero at a limit and positive inside.
 
-        They are functions of time, state, commands and varied.
+        They are functions of time, state, commands and the numbers that are ranges, in
+        the order of `limit_names`.
         """
-        size = len(self.state)
         is_elastic = self.scene.stroke.at_end == "elastic"
 
         def distances(
             traced_scene: Parts, time: Any, *state_and_commands: Any
         ) -> list[Any]:
-            legs = list(kernel.leg_motions(traced_scene.model, state_and_commands))
-            first, second, third = (leg.g for leg in legs)
+            of = divide(self._sizes, state_and_commands)
+            legs = list(kernel.leg_motions(traced_scene.model, of["state"]))
             angles = [
                 kernel.joint_angle(leg, joint_kind)
                 for joint_kind in range(3)
                 for leg in legs
             ]
-            ends = {0: traced_scene.axes.arc, 2: [traced_scene.axes.beta_max] * 3}
+            gamma = angles[:LEGS]
+            arc = traced_scene.axes.arc
             values = []
             for limit in self.stops:
-                joint_kind, k = divmod(limit.joint, 3)
-                end = limit.end
-                if limit.sign < 0.0 and joint_kind in ends:
-                    end = ends[joint_kind][k]
-                values.append(limit.sign * (angles[limit.joint] - end))
+                end = _end_of(traced_scene, limit)
+                values.append(limit._replace(end=end).distance(angles))
+            first, second, third = (leg.g for leg in legs)
             values.append(dot3(first, cross3(second, third)))
-            for k in range(3 if is_elastic else 0):
-                values += [angles[k], traced_scene.axes.arc[k] - angles[k]]
+            if is_elastic:
+                for angle, most in zip(gamma, arc, strict=True):
+                    values += [angle, most - angle]
             torque_limit = getattr(traced_scene.scene.actuators, "torque_limit", None)
             if torque_limit is not None:
-                unlimited = self._unlimited(
-                    traced_scene, time, state_and_commands[size : size + 3]
-                )
-                values += [(torque_limit - x) * (torque_limit + x) for x in unlimited]
+                for torque in self._unlimited(traced_scene, time, of["command"]):
+                    values.append((torque_limit - torque) * (torque_limit + torque))
             return values
 
-        inputs = ("t", *self.state, *(self._tick_inputs or TORQUE_SYMBOLS))
-        return self.balls.compile(distances, inputs)
+        return self.balls.compile(distances, self._function_inputs)
+
+
+def _end_of(traced_scene: Parts, limit: Limit) -> Any:
+    """Return the end of a limit, in symbols where the numbers of a scene make it."""
+    joint_kind, leg = divmod(limit.joint, LEGS)
+    if limit.sign < 0.0 and JOINT_QUANTITIES[joint_kind] == "gamma":
+        return traced_scene.axes.arc[leg]
+    if limit.sign < 0.0 and JOINT_QUANTITIES[joint_kind] == "beta":
+        return traced_scene.axes.beta_max
+    return limit.end
 
 
 def _start_equations(orientation: Quadruple) -> Callable[..., list[Any]]:
@@ -453,17 +514,16 @@ def _start_equations(orientation: Quadruple) -> Callable[..., list[Any]]:
     """
 
     def equations(traced_scene: Parts, *inputs: Any) -> list[Any]:
-        turn = inputs[0:3]
-        body_rate = inputs[3:6]
-        angles = inputs[6:9]
-        rates = inputs[9:12]
-        q = quaternion_product(orientation, (turn[0], turn[1], turn[2], 1.0))
-        legs = list(kernel.leg_motions(traced_scene.model, (*q, *body_rate)))
-        gaps = []
-        for leg, angle in zip(legs, angles, strict=True):
+        of = divide(_START_SIZES, inputs)
+        turned = quaternion_product(orientation, (*of["turn"], 1.0))
+        legs = kernel.leg_motions(traced_scene.model, (*turned, *of["body_rate"]))
+        angle_gaps = []
+        rate_gaps = []
+        for leg, angle, rate in zip(legs, of["gamma"], of["gamma_dot"], strict=True):
             sine, cosine = kernel.direction_of(leg, 0)
-            gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
-        return gaps + [leg.gamma_dot - x for leg, x in zip(legs, rates, strict=True)]
+            angle_gaps.append(sine * gm.cos(angle) - cosine * gm.sin(angle))
+            rate_gaps.append(leg.gamma_dot - rate)
+        return [*angle_gaps, *rate_gaps]
 
     return equations
 
@@ -488,11 +548,11 @@ class Follower:
     def __init__(self, equations: BallEquations, trajectory: Trajectory) -> None:
         self._equations = equations
         self._trajectory = trajectory
-        self._left = trajectory.t.tolist()
+        self._times_left = trajectory.t.tolist()  # of rows that are not proven yet
         self.rows: list[Row] = []
         self.tracking: list[TrackingRow] = []
         names = [*equations.limit_names, *equations.turn_names]
-        self.signs: dict[str, list[Span]] = {name: [] for name in names}
+        self.signs: dict[str, list[SignSpan]] = {name: [] for name in names}
         self.until = 0.0
         self.reason = ""
         self.steps = 0
@@ -515,10 +575,11 @@ class Follower:
     ) -> None:
         """Prove step by step from one break in time to the next.
 
-        This goes on as long as steps can be proven.
+        Where a step is not proven, the proof ends, and `reason` says why.
         """
-        order = max(14, math.ceil(ORDER * math.log10(tolerance)))
-        # What overflows in doubles is no number, and is refused as one.
+        digits = -math.log10(tolerance)
+        order = max(LEAST_ORDER, math.ceil(ORDER_PER_DIGIT * digits))
+        # NumPy need not warn of what overflows in doubles: it is refused.
         try:
             with np.errstate(all="ignore"):
                 self._follow(breaks, tolerance, order, max_steps, bar)
@@ -556,10 +617,7 @@ class Follower:
             self._sample(loop, region)
 
     def _sample(self, loop: SampledLoop, region: Region) -> Region:
-        """Return the region behind a tick of the controller.
-
-        Keep the tracking error.
-        """
+        """Return the region behind a tick of the controller; keep what it tracks."""
         region, row = loop.sample(region)
         self.tracking.append(row)
         return region
@@ -572,13 +630,13 @@ class Follower:
         stop_names = self._equations.stop_names
         for low, high, signs in _signs(step, limits, len(names), SPLITS):
             for name, sign in zip(names, signs, strict=True):
-                self.signs[name].append((low, high, sign))
+                self.signs[name].append(SignSpan(low, high, sign))
                 if name in stop_names and sign <= 0 and low < end:
                     self.reason = name
                     end = low
         self.until = end
-        while self._left and self._left[0] <= end:
-            self.rows.append(self._row(step, self._left.pop(0)))
+        while self._times_left and self._times_left[0] <= end:
+            self.rows.append(self._row(step, self._times_left.pop(0)))
 
     def _note_turns(self, step: Advance, begin: float, end: float) -> None:
         """Note when joints with dry friction may turn back in a step.
@@ -589,88 +647,108 @@ class Follower:
         rates = self._equations.turns_between(begin, end)
         for low, high, signs in _signs(step, rates, len(names), TURN_SPLITS):
             for name, sign in zip(names, signs, strict=True):
-                self.signs[name].append((low, high, sign))
+                self.signs[name].append(SignSpan(low, high, sign))
 
     def _row(self, step: Advance, time: float) -> Row:
-        p, e = step.at(time)
-        varied = len(self._equations.balls.inputs)
-        # of the state, without a lag, and what is a range
-        joint_inputs = [*range(len(MOTION)), *range(len(p) - varied, len(p))]
-        centre = [p[i] for i in joint_inputs]
-        values = [*zip(p[4:7], e[4:7], strict=True)]
-        try:
-            joints = self._equations.joints(*centre)
-            slopes = self._equations.joints(*(arb(p[i], e[i]) for i in joint_inputs))
-            by = [[arb(0)] * len(p) for _ in range(JOINT_COUNT)]
-            for place, i in enumerate(joint_inputs):
-                for row in range(JOINT_COUNT):
-                    by[row][i] = arb(slopes[JOINT_COUNT * (place + 1) + row])
-            bounds = step.at(time, arb_mat(by))[1]
-            values += zip(joints[:JOINT_COUNT], bounds, strict=True)
-        except Refused:  # an angle passes pi
-            half = JOINT_COUNT // 2
-            values += [(0, arb.pi())] * half + [(0, arb("inf"))] * half
-        floats = [float(x) for x, _ in values]
-        pairs = [
-            (x, upper(abs(ball - x) + r))
-            for x, (ball, r) in zip(floats, values, strict=True)
-        ]
-        length = norm(p[:4])
-        relative_error = norm(e[:4]) / length
-        quaternion = [float(x / length) for x in p[:4]]
-        simulated = self._trajectory.quaternion[len(self.rows)].tolist()
-        angles = [arb.pi(), arb.pi()]
-        if relative_error < 1:
-            angles = [
-                2 * relative_error.asin() + _turn(p[:4], q)
-                for q in (quaternion, simulated)
-            ]
-        return Row(time, quaternion, upper(angles[0]), upper(angles[1]), pairs)
-
-
-def unite(proofs: Sequence[Follower]) -> tuple[list[Row], dict[str, list[Span]]]:
-    """Return the rows that hold for all motions of some proofs.
-
-    The spans of all of them are returned, too.
-    """
-    first = proofs[0]
-    until = min(proof.until for proof in proofs)
-    rows = []
-    for rows_at in zip(*(proof.rows for proof in proofs), strict=False):
-        if rows_at[0].time > until:
-            break
-        centre = rows_at[0].quaternion
-        turns = [_turn([arb(x) for x in row.quaternion], centre) for row in rows_at]
-        angles = [
-            upper(turn + row.angle) for turn, row in zip(turns, rows_at, strict=True)
+        """Return what a step proves at an instant."""
+        p, error_bounds = step.at(time)
+        q = p[QUATERNION]
+        balls = [
+            *zip(p[STAR_RATE], error_bounds[STAR_RATE], strict=True),
+            *self._joint_balls(step, time, p, error_bounds),
         ]
         values = []
-        for pairs in zip(*(row.values for row in rows_at), strict=True):
-            ball = between(pairs[0][0], pairs[0][0])
-            for x, bound in pairs:
-                ball = ball.union(arb(x, bound))
-            values.append((float(ball), upper(abs(ball - float(ball)))))
-        distance = max(row.distance for row in rows_at)
-        rows.append(Row(rows_at[0].time, centre, max(angles), distance, values))
-    if len(proofs) == 1:
-        rows = first.rows
-    spans = {
-        name: sorted(x for proof in proofs for x in proof.signs[name])
-        for name in first.signs
-    }
+        for middle, radius in balls:
+            centre = float(middle)
+            values.append((centre, upper(abs(middle - centre) + radius)))
+        length = norm(q)
+        relative_error = norm(error_bounds[QUATERNION]) / length
+        quaternion = [float(x / length) for x in q]
+        simulated = self._trajectory.quaternion[len(self.rows)].tolist()
+        angle = arb.pi()
+        distance = arb.pi()
+        if relative_error < 1:
+            from_middle = 2 * relative_error.asin()
+            angle = from_middle + _turn(q, quaternion)
+            distance = from_middle + _turn(q, simulated)
+        return Row(time, quaternion, upper(angle), upper(distance), values)
+
+    def _joint_balls(
+        self, step: Advance, time: float, p: list[Any], error_bounds: list[Any]
+    ) -> list[tuple[Any, Any]]:
+        """Return middles and bounds of the angles and rates of the joints.
+
+        At an instant the state is in p +- error_bounds.
+        """
+        varied = len(self._equations.balls.inputs)
+        # Joints depend on the state without lagged torques, and on the ranges.
+        inputs = [*range(STATE_SIZE), *range(len(p) - varied, len(p))]
+        try:
+            at_middle = self._equations.joints(*(p[i] for i in inputs))
+            in_box = self._equations.joints(
+                *(arb(p[i], error_bounds[i]) for i in inputs)
+            )
+            _, *slopes = rows_of(in_box, ANGLES_AND_RATES)
+            slopes_by_place = dict(zip(inputs, slopes, strict=True))
+            no_slopes = [arb(0)] * ANGLES_AND_RATES
+            by_state = from_columns(
+                [slopes_by_place.get(place, no_slopes) for place in range(len(p))]
+            )
+            _, joint_bounds = step.at(time, by_state)
+        except Refused:  # an angle passes pi
+            half = ANGLES_AND_RATES // 2
+            return [(0, arb.pi())] * half + [(0, arb("inf"))] * half
+        return list(zip(at_middle[:ANGLES_AND_RATES], joint_bounds, strict=True))
+
+
+def unite(proofs: Sequence[Follower]) -> tuple[list[Row], dict[str, list[SignSpan]]]:
+    """Return rows that hold for all motions of some proofs, and all of their spans."""
+    spans: dict[str, list[SignSpan]] = {}
+    for name in proofs[0].signs:
+        spans[name] = sorted(span for proof in proofs for span in proof.signs[name])
+    if len(proofs) == 1:  # rows that were united would be wider by rounding
+        return proofs[0].rows, spans
+    until = min(proof.until for proof in proofs)
+    rows = []
+    for rows_at_time in zip(*(proof.rows for proof in proofs), strict=False):
+        if rows_at_time[0].time > until:
+            break
+        rows.append(_unite_rows(rows_at_time))
     return rows, spans
+
+
+def _unite_rows(rows: Sequence[Row]) -> Row:
+    """Return a row that holds for all motions of some rows at the same instant."""
+    time = rows[0].time
+    quaternion = rows[0].quaternion
+    angles = []
+    for row in rows:
+        turn = _turn([arb(x) for x in row.quaternion], quaternion)
+        angles.append(upper(turn + row.angle))
+    values = []
+    for pairs in zip(*(row.values for row in rows), strict=True):
+        first_middle, _ = pairs[0]
+        ball = between(first_middle, first_middle)
+        for middle, bound in pairs:
+            ball = ball.union(arb(middle, bound))
+        centre = float(ball)
+        values.append((centre, upper(abs(ball - centre))))
+    distance = max(row.distance for row in rows)
+    return Row(time, quaternion, max(angles), distance, values)
 
 
 def track_columns(proofs: Sequence[Follower], until: float) -> dict[str, Array]:
     """Return what holds for all parts at the ticks: middles and bounds by name."""
     table: dict[str, list[float]] = {}
-    for rows_at in zip(*(proof.tracking for proof in proofs), strict=False):
-        if rows_at[0].time > until:
+    for rows_at_time in zip(*(proof.tracking for proof in proofs), strict=False):
+        time = rows_at_time[0].time
+        if time > until:
             break
-        table.setdefault("t", []).append(rows_at[0].time)
-        for name in ("error", "torque"):
-            by_leg = zip(*(getattr(row, name) for row in rows_at), strict=True)
-            for leg, pairs in enumerate(by_leg, 1):
+        table.setdefault("t", []).append(time)
+        errors = zip(*(row.error for row in rows_at_time), strict=True)
+        torques = zip(*(row.torque for row in rows_at_time), strict=True)
+        for name, pairs_by_leg in (("error", errors), ("torque", torques)):
+            for leg, pairs in enumerate(pairs_by_leg, 1):
                 middle, bound = _hull(pairs)
                 table.setdefault(f"{name}_{leg}", []).append(middle)
                 table.setdefault(f"{name}_{leg}_bound", []).append(bound)
@@ -678,10 +756,9 @@ def track_columns(proofs: Sequence[Follower], until: float) -> dict[str, Array]:
 
 
 def _hull(pairs: Sequence[tuple[Any, Any]]) -> tuple[float, float]:
-    """Return a number and how far any of some numbers with bounds can be from it."""
-    hull = arb(pairs[0][0]) + arb(0, pairs[0][1])
-    for middle, bound in pairs[1:]:
-        hull = hull.union(arb(middle) + arb(0, bound))
+    """Return a number, and a bound of how far some numbers with bounds are from it."""
+    hulls = [arb(middle) + arb(0, bound) for middle, bound in pairs]
+    hull = reduce(arb.union, hulls)
     centre = float(hull)
     return centre, upper(abs(hull - centre))
 
@@ -726,7 +803,7 @@ class ProvenMotion(Explained):
         self.steps = sum(proof.steps for proof in parts)
         self._is_whole = not failed
         rows, spans = unite(parts)
-        names = [*(f"body_rate_{axis}" for axis in "xyz")]
+        names = [f"body_rate_{axis}" for axis in "xyz"]
         names += [f"{joint}_{leg}" for joint in JOINT_QUANTITIES for leg in (1, 2, 3)]
         quaternion = np.array([row.quaternion for row in rows]).reshape(-1, 4)
         values = np.array([row.values for row in rows]).reshape(-1, len(names), 2)
@@ -760,21 +837,21 @@ class ProvenMotion(Explained):
     def largest(self) -> float:
         """Largest angle between true orientation and that of the table [rad].
 
-        Inf without one.
+        It is inf where the table has no row.
         """
-        return float(
-            np.max(self.columns["angle"], initial=0.0 if len(self) else math.inf)
-        )
+        return self._largest_of("angle")
 
     @property
     def error(self) -> float:
         """Largest distance of `simulate` from the true motion [rad].
 
-        Inf without one.
+        It is inf where the table has no row.
         """
-        return float(
-            np.max(self.columns["distance"], initial=0.0 if len(self) else math.inf)
-        )
+        return self._largest_of("distance")
+
+    def _largest_of(self, name: str) -> float:
+        """Return the largest number of a column; inf where it has none."""
+        return float(max(self.columns[name], default=math.inf))
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -790,11 +867,10 @@ class ProvenMotion(Explained):
         return require("pandas").DataFrame(self.columns)
 
     def _facts(self) -> dict[str, object]:
-        met = [
-            f"{name}: {write_down(begin, 15)} to {write_up(end, 15)} s"
-            for name, spans in self.limits.items()
-            for begin, end in spans
-        ]
+        met = []
+        for name, spans in self.limits.items():
+            for begin, end in spans:
+                met.append(f"{name}: {write_down(begin, 15)} to {write_up(end, 15)} s")
         until = f"to {write_down(self.until, 15)} s"
         if self.reason:
             until = f"{until}: {self.reason}"
@@ -814,30 +890,34 @@ class ProvenMotion(Explained):
 
 
 def _unknown_spans(
-    sign_spans: Sequence[Span], until: float
+    sign_spans: Sequence[SignSpan], until: float
 ) -> list[tuple[float, float]]:
     """Join the spans whose sign is not known, of those that begin by a time."""
     joined: list[tuple[float, float]] = []
     for begin, end, sign in sign_spans:
         if sign != 0 or begin > until:
             continue
-        if joined and begin <= joined[-1][1]:
-            joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
-        else:
-            joined.append((begin, end))
+        if joined:
+            last_begin, last_end = joined[-1]
+            if begin <= last_end:
+                joined[-1] = (last_begin, max(end, last_end))
+                continue
+        joined.append((begin, end))
     return joined
 
 
 def _turn(a: Sequence[Any], b: Sequence[Any]) -> Any:
     """Angle of the rotation between quaternions, as a ball [rad]."""
-    pairs = [
-        (x / norm(a), arb(y) / norm(list(map(arb, b))))
-        for x, y in zip(a, b, strict=True)
-    ]
+    a_length = norm(a)
+    b_length = norm(list(map(arb, b)))
+    unit_a = [x / a_length for x in a]
+    unit_b = [arb(y) / b_length for y in b]
+    differences = [x - y for x, y in zip(unit_a, unit_b, strict=True)]
+    sums = [x + y for x, y in zip(unit_a, unit_b, strict=True)]
     # Unit quaternions an angle apart have the chord 2 sin(angle / 4); q and -q are one
     # orientation.
-    chords = (norm([x - sign * y for x, y in pairs]) for sign in (1, -1))
-    return 4 * (min(chords, key=float) / 2).asin()
+    chord = min(norm(differences), norm(sums), key=float)
+    return 4 * (chord / 2).asin()
 
 
 def _signs(
@@ -845,25 +925,37 @@ def _signs(
 ) -> Iterator[tuple[float, float, Sequence[int]]]:
     """Split a step into spans of time by the signs of numbers.
 
-    Numbers are > 0 (1), < 0 (-1), or unknown (0).
+    Each span has its begin and end [s], and the signs of the numbers in it: > 0 (1), <
+    0 (-1), or unknown (0). Spans with unknown signs are halved, `splits` times at most.
     """
     begin = step.begin.time
+    shortest = SHORTEST_SPAN * (step.end - begin)
     splits_left = splits
-    todo = [(begin, step.end)]
-    while todo:
-        low, high = todo.pop()
+    open_spans = [(begin, step.end)]
+    while open_spans:
+        low, high = open_spans.pop()
         splits_left -= 1
-        span = (arb(low) - begin, arb(high) - begin)
         signs = [0] * count
-        time_offset = between(span[0] - span[1], span[1] - span[0]) / 2
         with suppress(ArithmeticError, ValueError):  # a division by what may be zero
-            rows = step.enclose(run, LIMIT_ORDER, step.tube, span)
-            values = [arb_poly(row)(time_offset) for row in rows]
-            signs = [int(bool(x > 0)) - int(bool(x < 0)) for x in values]
-        if all(signs) or splits_left < 0 or high - low < 1e-10 * (step.end - begin):
+            signs = _signs_in(step, run, low, high)
+        if all(signs) or splits_left < 0 or high - low < shortest:
             yield low, high, signs
         else:
-            todo += [(0.5 * (low + high), high), (low, 0.5 * (low + high))]
+            middle = 0.5 * (low + high)
+            open_spans.append((middle, high))
+            open_spans.append((low, middle))
+
+
+def _signs_in(step: Advance, run: Function, low: float, high: float) -> list[int]:
+    """Return the signs of numbers in a span of time of a step [s]; 0 if unknown."""
+    begin = step.begin.time
+    span = (arb(low) - begin, arb(high) - begin)
+    from_middle = between(span[0] - span[1], span[1] - span[0]) / 2
+    signs = []
+    for coefficients in step.enclose(run, LIMIT_ORDER, step.tube, span):
+        value = arb_poly(coefficients)(from_middle)
+        signs.append(int(bool(value > 0)) - int(bool(value < 0)))
+    return signs
 
 
 def split_ranges(ranges: Mapping[Place, Any], box_count: int) -> list[dict[Place, Any]]:
@@ -874,15 +966,16 @@ def split_ranges(ranges: Mapping[Place, Any], box_count: int) -> list[dict[Place
     boxes = [dict(ranges)]
     while len(boxes) < box_count:
         box = boxes.pop(0)
-        widest = max(
-            box, key=lambda place: float(box[place].rad() / ranges[place].rad())
-        )
+        shares = {
+            place: float(ball.rad() / ranges[place].rad())
+            for place, ball in box.items()
+        }
+        widest = max(shares, key=shares.__getitem__)
         middle = box[widest].mid()
         quarter = box[widest].rad() / 2
         for centre in (middle - quarter, middle + quarter):
-            boxes.append(
-                box | {widest: arb(centre.mid(), (quarter + centre.rad()).upper())}
-            )
+            half = arb(centre.mid(), (quarter + centre.rad()).upper())
+            boxes.append(box | {widest: half})
     return boxes
 
 
@@ -901,7 +994,7 @@ class ProofTask(NamedTuple):
     def prove(self, ranges: Mapping[Place, Any], label: str = "certify") -> Follower:
         """Prove the motion for all numbers of ranges."""
         scene = self.trajectory.scene
-        tolerance = 1e-6 * self.bound
+        tolerance = FIRST_TOLERANCE * self.bound
         for _ in range(PROOF_ATTEMPTS):
             equations = BallEquations(scene, self.profile, ranges, self.control)
             follower = Follower(equations, self.trajectory)
@@ -913,7 +1006,7 @@ class ProofTask(NamedTuple):
                 break
             if follower.largest == math.inf:
                 break
-            tolerance *= 0.1 * self.bound / follower.largest
+            tolerance *= NEXT_TOLERANCE * self.bound / follower.largest
         return follower
 
     def prove_boxes(self, ranges: Mapping[Place, Any]) -> list[Follower]:

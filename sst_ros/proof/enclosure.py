@@ -22,7 +22,6 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import reduce
-from itertools import islice
 from operator import methodcaller
 from typing import Any, NamedTuple, NoReturn
 
@@ -34,36 +33,79 @@ from sst_ros.proof.balls import (
     arb_mat,
     arb_poly,
     arb_series,
+    around_zero,
     between,
     column,
     entries,
+    from_columns,
+    identity,
     magnitude,
+    middles,
+    radii,
+    rows_of,
+    zeros,
 )
 
 Function = Callable[..., Sequence[Any]]
 
-J_ORDER, V_ORDER = 8, 16  # of the Jacobian and of V
+# Orders of expansions: higher ones are tighter and take longer.
+J_ORDER = 8  # of the Jacobian
+V_ORDER = 16  # of V
 KINK_V_ORDER = 4  # of V in a step across a kink
 JACOBIAN_TERMS = 4  # coefficients of the Jacobian that p is found by
+
+# Sets.
 SKEW = 1e4  # condition of the axes of a set beyond which they are made orthogonal
 REMAINDER_GROWTH = 0.05  # of a set by the remainder of V, largest in a step
+LOSS = 1e-4  # of a set in a step, relative to it: shorter steps are tried beyond it
+UNSEEN = 0.01  # share of the tolerance below which a step may widen the set
+MUCH_LESS = 0.2  # loss of a shorter step that is worth it, relative to the longer one's
+# Weights of a norm are found by power iteration: its steps, what of the last weights is
+# kept in each so that it converges, and the least weight by the largest.
+WEIGHT_STEPS = 20
+KEPT_WEIGHT = 1e-3
+LEAST_WEIGHT = 1e-9
+
+# Tubes, wider than what they are around.
+ROOM = 3  # around a region, times it
+MOST_ROOM = 100  # the same where steps need more
+TIGHT = 1.1  # around what a step was proven to reach, times that
+TUBE_TRIES = 4  # wider tubes for a step before it is made shorter
+# times the tolerance: a wider tube is not tried for an error that grows more in a step
+SLOW_GROWTH = 10.0
+
+# Lengths of steps: they decide how long a proof takes, not what is true.
+FIRST_FACTOR = 0.4  # first step by the longest that its series allows, see `_plan`
+GROWTH = 4.0  # longest next step by the usual one
+REGAIN = 1.25  # longest next step by the last one, after a step was refused
+SHORTER = 0.6  # next try by the last one, where a set grows too much
+DEFECT_MARGIN = 0.9  # next try by what should just do, where the defect is too large
+LEAST_SHORTER = 0.2  # next try by the last one, at least
+DEFECT_AIM = 0.5  # defect that the next step is to have, relative to the tolerance
+# Change of this factor from a step to the next.
+LEAST_CHANGE = 0.7
+MOST_CHANGE = 1.3
+LEAST_USUAL = 0.1  # by which a single short step makes the usual one shorter, at most
+END_MARGIN = 1.01  # a step that is shorter than the time left by less takes all of it
+LEAST_STEP = 1e-9  # of a step, relative to the whole time: the proof ends
+KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
+KINK_STEPS = 400  # steps across one kink before the proof ends
+KINK_LOSS = 0.02  # of a set in a step across a kink: below it the next is longer
+KINK_HALVINGS = 30  # of the time in which a kink is looked for
+
 CUT = "an angle may pass pi, where that of the model jumps"
 UNBOUNDED = "a number is not bounded: a singularity may be near"
-LEAST_STEP = 1e-9  # of a step, relative to the whole time: the proof ends
-TIGHT = 1.1  # room of a tube around what a step was proven to reach
-# of a set in a step, relative to it: more is tried to be avoided by shorter steps
-LOSS = 1e-4
-KINK_STEP = 1e-11  # first step across a kink, relative to the whole time
-UNSEEN = 0.01  # share of the tolerance below which a step may widen the set
-REGAIN = 1.25  # longest next step by the last one, after a step was refused
-KINK_STEPS = 400  # steps across one kink before the proof ends
-# of a set in a step across a kink, below which the next is twice as long
-KINK_LOSS = 0.02
-KINK_HALVINGS = 30  # of the time in which a kink is looked for
 
 
 class Refused(ArithmeticError):
-    """A step is not proven: how much shorter, or in what wider tube, it may be."""
+    """A step is not proven.
+
+    Attributes:
+        shorter: length of the next try, as a share of that of the step.
+        wider: tube in which the step may be proven as it is; None where that is in
+            vain.
+
+    """
 
     def __init__(
         self, reason: str, shorter: float = 0.5, wider: list[Any] | None = None
@@ -77,7 +119,8 @@ class KinkMet(Refused):
     """A function has a kink, or may have one, in what is looked at."""
 
 
-def _middles(matrix: Any) -> np.ndarray[Any, Any]:
+def _to_floats(matrix: Any) -> np.ndarray[Any, Any]:
+    """Return the middles of the entries of a matrix as doubles."""
     return np.array([[float(x.mid()) for x in row] for row in matrix.tolist()])
 
 
@@ -105,10 +148,10 @@ def _atan2(y: Any, x: Any) -> Any:
     angle = arb.atan2(sine, cosine)
     if not isinstance(y, arb_series) and not isinstance(x, arb_series):
         return angle
-    y, x = arb_series(y), arb_series(x)
-    return (
-        (y.derivative() * x - x.derivative() * y) / (x * x + y * y)
-    ).integral() + angle
+    y = arb_series(y)
+    x = arb_series(x)
+    slope = (y.derivative() * x - x.derivative() * y) / (x * x + y * y)
+    return slope.integral() + angle
 
 
 class _Kink:
@@ -120,12 +163,12 @@ class _Kink:
 
     def __mul__(self, other: Any) -> Any:
         numbers = other.coeffs() if isinstance(other, arb_series) else [other]
-        # A ball around zero is neither == 0 nor != 0.
-        return (
-            arb(0)
-            if all(not isinstance(x, _Kink) and x == 0 for x in numbers)
-            else self
-        )
+        for number in numbers:
+            # A ball around zero is neither == 0 nor != 0.
+            is_zero = not isinstance(number, _Kink) and number == 0
+            if not is_zero:
+                return self
+        return arb(0)
 
     __rmul__ = __mul__
 
@@ -141,28 +184,26 @@ class _KinkWatch:
 
     Its value anywhere in the span is that in the middle and its derivative times the
     time from there (the mean value theorem), which is narrower than its value in
-    interval arithmetic. So the values in the middle are noted in the order in which a
-    program computes them, then read again.
+    interval arithmetic. So a program is run at the middle first, and the values are
+    noted in the order in which it computes them; then it is run in all of the span, and
+    reads them in this order.
     """
 
     def __init__(self) -> None:
-        self._middles: list[Any] = []
-        # largest time from the middle, where the values are read
+        self._noted: list[Any] = []
+        # largest time from the middle; None where the values are noted
         self._reach: Any = None
-        self._next = 0
+        self._next = 0  # of the noted values
 
     @contextlib.contextmanager
     def within(self, reach: Any = None) -> Iterator[None]:
-        """Note the values in the middle of a span.
-
-        With a reach, use them for times within it.
-        """
+        """Note the values in the middle of a span; read them where there is a reach."""
         global _watch
         before, _watch = _watch, self
         self._reach = reach
         self._next = 0
         if reach is None:
-            self._middles.clear()
+            self._noted.clear()
         try:
             yield
         finally:
@@ -172,17 +213,18 @@ class _KinkWatch:
         """Return the value of a number, narrower where its middle is known."""
         value = _first(x)
         if self._reach is None:
-            self._middles.append(value)
+            self._noted.append(value)
             return value
-        middle = self._middles[self._next] if self._next < len(self._middles) else value
+        middle = value
+        if self._next < len(self._noted):
+            middle = self._noted[self._next]
         self._next += 1
-        if (
-            isinstance(value, _Kink)
-            or isinstance(middle, _Kink)
-            or not isinstance(x, arb_series)
-        ):
+        if isinstance(value, _Kink) or isinstance(middle, _Kink):
             return value
-        if x.prec < 2 or isinstance(slope := x[1], _Kink):
+        if not isinstance(x, arb_series) or x.prec < 2:
+            return value
+        slope = x[1]
+        if isinstance(slope, _Kink):
             return value
         moved = middle + slope * between(-self._reach, self._reach)
         return moved if moved.rad() < value.rad() else value
@@ -261,10 +303,7 @@ def _step_of(x: Any) -> Any:
 
 
 def cut(x: Any, _zero: float = 0.0) -> Any:
-    """Return x where x > 0 and 0 elsewhere.
-
-    Of a number on both sides, all that may be.
-    """
+    """Return max(x, 0): of a number on both sides of zero, all that may be."""
     side = _side(x)
     if side is not None:
         return x * side
@@ -283,20 +322,19 @@ def compile_on_balls(program: Program, constants: Sequence[Any]) -> Function:
     The constants are the values of its last inputs.
     """
     count = len(program.inputs) - len(constants)
-    before, after, results = program.split(range(count))
+    once, always, results = program.split(range(count))
     names = _ON_BALLS | dict(zip(program.inputs[count:], constants, strict=True))
-    before, after = (
-        [
-            re.sub(r"\(1\.0 if (.+) > 0\.0 else 0\.0\)", r"step(\1)", line)
-            for line in lines
-        ]
-        for lines in (before, after)
-    )
-    execute("\n".join(before), names)
-    lines = [f"def function({', '.join(program.inputs[:count])}):", *after]
-    execute("\n    ".join([*lines, f"return ({', '.join(results)},)"]), names)
+    execute(_name_steps("\n".join(once)), names)
+    head = f"def function({', '.join(program.inputs[:count])}):"
+    last = f"return ({', '.join(results)},)"
+    execute(_name_steps("\n    ".join([head, *always, last])), names)
     function: Function = names["function"]
     return function
+
+
+def _name_steps(source: str) -> str:
+    """Call `step` in the source of a program where it compares a number with zero."""
+    return re.sub(r"\(1\.0 if (.+) > 0\.0 else 0\.0\)", r"step(\1)", source)
 
 
 def _series(polynomial: Any, size: int) -> Any:
@@ -310,9 +348,8 @@ def _coefficients(x: Any, size: int) -> list[Any]:
     if not isinstance(x, arb_series):
         return [arb(x), *[arb(0)] * (size - 1)]
     if x.prec < size:
-        raise Refused(
-            "a series is shorter than asked: another thread uses python-flint"
-        )
+        reason = "a series is shorter than asked: another thread uses python-flint"
+        raise Refused(reason)
     coefficients = x.coeffs()
     return [*coefficients, *[arb(0)] * size][:size]
 
@@ -323,12 +360,12 @@ def _coefficients(x: Any, size: int) -> list[Any]:
 class Region(NamedTuple):
     """Where the solution is at a time: centre + C a + B b.
 
-    All |a_i| and |b_i| are bounded.
+    The numbers a and b here are columns of bounds of all |a_i| and |b_i|.
     """
 
     time: float
     centre: list[Any]  # exact
-    c: Any
+    c: Any  # exact, as all that follow
     a: Any
     axes: Any  # B
     b: Any
@@ -343,16 +380,9 @@ class Region(NamedTuple):
     def box(cls, time: float, balls: Sequence[Any]) -> Region:
         """Return the region of all that lies in balls."""
         n = len(balls)
-        identity = arb_mat(n, n, [0] * (n * n)) + 1
-        zero = column([0] * n)
-        return cls(
-            time,
-            [x.mid() for x in balls],
-            identity,
-            column([x.rad() for x in balls]),
-            identity,
-            zero,
-        )
+        axes = identity(n)
+        widths = column(radii(balls))
+        return cls(time, middles(balls), axes, widths, axes, b=column([0] * n))
 
     @classmethod
     def linear(
@@ -365,15 +395,14 @@ class Region(NamedTuple):
         fixed: int,
     ) -> Region:
         """Return the region of all centre + C a +- errors, whose numbers are balls."""
-        n = len(centre)
-        exact = c.mid()
-        identity = arb_mat(n, n, [0] * (n * n)) + 1
+        exact_c = c.mid()
         widths = column([arb(x).upper() for x in a])
-        error_bounds = column([x.rad() for x in centre]) + column(
+        error_bounds = column(radii(centre)) + column(
             [arb(x).abs_upper() for x in errors]
         )
-        b = magnitude(magnitude(c - exact) * widths + error_bounds)
-        return cls(time, [x.mid() for x in centre], exact, widths, identity, b, fixed)
+        b = magnitude(magnitude(c - exact_c) * widths + error_bounds)
+        axes = identity(len(centre))
+        return cls(time, middles(centre), exact_c, widths, axes, b, fixed)
 
     def spread(self, by: Any = 1) -> Any:
         """Bound each number of by e."""
@@ -381,10 +410,7 @@ class Region(NamedTuple):
 
 
 class Advance(NamedTuple):
-    """A step from begin to end: the solution is p(s) + V(s) e(0) + w.
-
-    All |w_i| are bounded.
-    """
+    """A step from begin to end: the solution is p(s) + V(s) e(0) + w."""
 
     begin: Region
     end: float
@@ -392,7 +418,7 @@ class Advance(NamedTuple):
     tube: list[Any]  # balls of e in the whole step, once proven those that it reaches
     defect: float = 0.0  # largest integral of |d_i|, not rounded outward
     v: Sequence[Any] = ()  # coefficients of V
-    w: Any = None
+    w: Any = None  # a column of bounds of all |w_i|
     weights: Sequence[Any] = ()  # of a norm in which the numbers of e are alike
 
     @property
@@ -413,9 +439,8 @@ class Advance(NamedTuple):
         """Return p at a time [s], and bounds of the numbers of by e."""
         s = arb(time) - arb(self.begin.time)
         w = magnitude(by * self.v[0]) * self.w
-        return [p(s) for p in self.p], entries(
-            magnitude(self.begin.spread(by * self.flow(s)) + w)
-        )
+        bounds = magnitude(self.begin.spread(by * self.flow(s)) + w)
+        return [p(s) for p in self.p], entries(bounds)
 
     def expand(
         self, function: Function, where: Any, size: int, tube: Sequence[Any]
@@ -424,14 +449,15 @@ class Advance(NamedTuple):
 
         It is a function of t and y = p + e, with e in `tube`.
         """
-        count = self.begin.moving
-        pairs = zip(self.p[:count], tube[:count], strict=True)
-        rows = (p(arb_poly([where, 1])) + e for p, e in pairs)
-        fixed = (x + e for x, e in zip(self.begin.centre, tube, strict=True))
+        from_there = arb_poly([where, 1])
+        state: list[Any] = []
+        for i, (p, e) in enumerate(zip(self.p, tube, strict=True)):
+            if i < self.begin.moving:
+                state.append(_series(p(from_there) + e, size))
+            else:
+                state.append(self.begin.centre[i] + e)
         time = arb_series([arb(self.begin.time) + where, 1], size)
-        series = (_series(row, size) for row in rows)
-        expansions = function(time, *series, *islice(fixed, count, None))
-        return [_coefficients(x, size) for x in expansions]
+        return [_coefficients(x, size) for x in function(time, *state)]
 
     def values(self, function: Function, where: Any, tube: Sequence[Any]) -> list[Any]:
         """Enclose the values of a function at s in `where`.
@@ -439,7 +465,7 @@ class Advance(NamedTuple):
         It is a function of t and y = p + e, with e in `tube`.
         """
         state = (p(where) + e for p, e in zip(self.p, tube, strict=True))
-        return [arb(x) for x in function(arb(self.begin.time) + where, *state)]
+        return list(map(arb, function(arb(self.begin.time) + where, *state)))
 
     def enclose(
         self,
@@ -458,35 +484,32 @@ class Advance(NamedTuple):
         begin, end = span or (arb(0), self.length)
         if order == 0:
             return [[x] for x in self.values(function, between(begin, end), tube)]
-        span_length = (end - begin) / span_count
+        part_length = (end - begin) / span_count
         watch = _KinkWatch()
         reach = ((end - begin) / 2).abs_upper()
         with watch.within():
-            middle_coefficients = self.expand(function, (begin + end) / 2, order, tube)
-        last = []
+            about_middle = self.expand(function, (begin + end) / 2, order, tube)
+        in_parts = []
         for k in range(span_count):
+            part = between(begin + k * part_length, begin + (k + 1) * part_length)
             with watch.within(reach):
-                where = between(begin + k * span_length, begin + (k + 1) * span_length)
-                last.append(self.expand(function, where, order + 1, tube))
-        return [
-            [*row, reduce(arb.union, (expansion[i][order] for expansion in last))]
-            for i, row in enumerate(middle_coefficients)
-        ]
+                in_parts.append(self.expand(function, part, order + 1, tube))
+        enclosed = []
+        for i, coefficients in enumerate(about_middle):
+            last = reduce(arb.union, (rows[i][order] for rows in in_parts))
+            enclosed.append([*coefficients, last])
+        return enclosed
 
 
 def shift(coefficients: Sequence[Any], by: Any) -> list[Any]:
     """Return the coefficients of a polynomial about another point."""
-    every = range(len(coefficients))
-    return [
-        sum(
-            (
-                coefficients[j] * (math.comb(j, k) * by ** (j - k))
-                for j in every[k + 1 :]
-            ),
-            c,
-        )
-        for k, c in enumerate(coefficients)
-    ]
+    shifted = []
+    for k, coefficient in enumerate(coefficients):
+        total = coefficient
+        for j in range(k + 1, len(coefficients)):
+            total = total + coefficients[j] * (math.comb(j, k) * by ** (j - k))
+        shifted.append(total)
+    return shifted
 
 
 def approximate(
@@ -494,33 +517,35 @@ def approximate(
 ) -> list[list[Any]]:
     """Return the coefficients of p.
 
-    A series f(t, p) gives the next coefficient of p, and nearly those that follow: what
-    they add to it is linear, by the Jacobian on what was known.
+    The series of f(t, p) gives the next coefficient, and nearly those after it: what
+    new coefficients add to the series is linear in them, by the Jacobian on the part of
+    p that was known.
     """
     n = len(region.centre)
     p = [[x] for x in region.centre]
-    j: list[Any] = []
+    j: list[Any] = []  # coefficients of the Jacobian
 
     def run(function: Function, size: int) -> list[list[Any]]:
+        time = arb_series([region.time, 1], size)
         series = (arb_series(row, size) for row in p[: region.moving])
-        expansions = function(
-            arb_series([region.time, 1], size), *series, *region.centre[region.moving :]
-        )
+        expansions = function(time, *series, *region.centre[region.moving :])
         return [_coefficients(x, size) for x in expansions]
 
-    while (known_count := len(p[0])) <= order:
+    known_count = 1
+    while known_count <= order:
         if known_count == JACOBIAN_TERMS:
             j = _matrices(run(jacobian, JACOBIAN_TERMS)[n:], n)
         slopes = run(f, min(known_count + len(j), order))
-        new: list[Any] = []
+        new_columns: list[Any] = []
         for k in range(known_count - 1, len(slopes[0])):
-            added = (j[k - i] * x for i, x in enumerate(new, known_count))
-            slope = sum(added, column([row[k] for row in slopes]))
-            new.append((slope / (k + 1)).mid())
-        for row, new_coefficients in zip(
-            p, zip(*map(entries, new), strict=True), strict=True
-        ):
-            row += new_coefficients
+            slope = column([row[k] for row in slopes])
+            for i, new_column in enumerate(new_columns, known_count):
+                slope = slope + j[k - i] * new_column
+            new_columns.append((slope / (k + 1)).mid())
+        for new_column in new_columns:
+            for row, coefficient in zip(p, entries(new_column), strict=True):
+                row.append(coefficient)
+        known_count += len(new_columns)
     return p
 
 
@@ -529,8 +554,10 @@ def _matrices(flat: Sequence[Sequence[Any]], n: int) -> list[Any]:
 
     Those of its entries are given column by column.
     """
-    rows = [[flat[n * c + r] for c in range(n)] for r in range(n)]
-    return [arb_mat([[x[k] for x in row] for row in rows]) for k in range(len(flat[0]))]
+    matrices = []
+    for numbers in zip(*flat, strict=True):
+        matrices.append(from_columns(rows_of(numbers, n)))
+    return matrices
 
 
 def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
@@ -544,10 +571,11 @@ def bound_defect(f: Function, step: Advance, order: int) -> list[list[Any]]:
     for p, row in zip(step.p, values, strict=True):
         slope = p.derivative()
         slopes = slope(about_middle) if order else [slope(between(0, step.length))]
-        d.append([(x - slopes[k]).abs_upper() for k, x in enumerate(row)])
-    # max() of Python would skip a nan
-    if not all(x.is_finite() for row in d for x in row):
-        raise Refused(UNBOUNDED)
+        bounds = [(x - slopes[k]).abs_upper() for k, x in enumerate(row)]
+        # max() of Python would skip a nan later
+        if not all(bound.is_finite() for bound in bounds):
+            raise Refused(UNBOUNDED)
+        d.append(bounds)
     return d
 
 
@@ -567,30 +595,33 @@ def prove(
     Lipschitz functions).
     """
     n = len(step.p)
-    j_order, v_order = (0, KINK_V_ORDER) if across_kink else (J_ORDER, V_ORDER)
-    defect_order = 0 if across_kink else order
+    moving = step.begin.moving
+    if across_kink:
+        j_order = 0
+        v_order = KINK_V_ORDER
+        defect_order = 0
+        largest_defect = math.inf
+    else:
+        j_order = J_ORDER
+        v_order = V_ORDER
+        defect_order = order
+        largest_defect = tolerance
     d = bound_defect(f, step, defect_order)
-    step = _measure_defect(step, d, order, math.inf if across_kink else tolerance)
+    step = _measure_defect(step, d, order, largest_defect)
     j = _matrices(step.enclose(jacobian, j_order, step.tube)[n:], n)
     step = step._replace(v=_fundamental(j, step.half, v_order))
-    remainder = _remainder(j, step)
     jacobian_in_step = _values_of(j, step.half)
     weights = _weights(jacobian_in_step)
-    source = entries(step.begin.spread(remainder))  # of (J V - V') e(0)
+    source = entries(step.begin.spread(_remainder(j, step)))  # of (J V - V') e(0)
     integrals = [x * step.length for x in source]
     for k in range(defect_order + 1):
         for i, row in enumerate(d):
             integrals[i] += 2 * row[k] * step.half ** (k + 1) / (k + 1)
-    by_norm = _bound_by_norm(
-        jacobian_in_step, weights, source, d[: step.begin.moving], step
-    )
-    by_number = _bound_by_number(
-        jacobian_in_step, integrals[: step.begin.moving], step.length
-    )
+    by_norm = _bound_by_norm(jacobian_in_step, weights, source, d[:moving], step)
+    by_number = _bound_by_number(jacobian_in_step, integrals[:moving], step.length)
     w = [x.min(y).upper() for x, y in zip(by_norm, by_number, strict=True)]
     w += [arb(0)] * step.begin.fixed
-    step = step._replace(w=column(w), weights=weights)
-    return _check_tube(step, tolerance)
+    return _check_tube(step._replace(w=column(w), weights=weights), tolerance)
 
 
 def _bound_by_norm(
@@ -601,21 +632,25 @@ def _bound_by_norm(
     step: Advance,
 ) -> list[Any]:
     """Bound w by the logarithmic norm of J, that of what moves."""
-    every = range(len(d))
+    moving = range(len(d))
     size = magnitude(jacobian)
     growth = arb(0)  # of J
     largest = arb(0)  # norm of (J V - V') e(0)
-    for i in every:
-        off_diagonal = sum((size[i, k] * weights[k] for k in every if k != i), arb(0))
+    for i in moving:
+        off_diagonal = arb(0)
+        for k in moving:
+            if k != i:
+                off_diagonal += size[i, k] * weights[k]
         growth = growth.max((jacobian[i, i] + off_diagonal / weights[i]).upper())
         largest = largest.max((source[i] / weights[i]).upper())
-    most = largest * step.length  # integral of the norm of both: not less than its norm
+    # The integral of the norm of both is not less than the norm of the integral.
+    most = largest * step.length
     for k in range(len(d[0])):
-        sizes = [(d[i][k] / weights[i]).upper() for i in every]
+        sizes = [(d[i][k] / weights[i]).upper() for i in moving]
         largest_size = reduce(arb.max, sizes)
         most += 2 * largest_size * step.half ** (k + 1) / (k + 1)
     bound = (growth * step.length).exp() * most
-    return [(bound * weights[i]).upper() for i in every]
+    return [(bound * weights[i]).upper() for i in moving]
 
 
 def _bound_by_number(jacobian: Any, integrals: Sequence[Any], length: Any) -> list[Any]:
@@ -625,10 +660,10 @@ def _bound_by_number(jacobian: Any, integrals: Sequence[Any], length: Any) -> li
     w_k, so that |w| <= exp(A h) (integral of |g|) where A bounds |J_ik|, and J_ii from
     0 on.
     """
-    every = range(len(integrals))
+    moving = range(len(integrals))
     size = magnitude(jacobian)
-    rates = [[size[i, k] * length for k in every] for i in every]
-    for i in every:
+    rates = [[size[i, k] * length for k in moving] for i in moving]
+    for i in moving:
         rates[i][i] = jacobian[i, i].upper().max(arb(0)) * length
     grown = arb_mat(rates).exp() * column([x.upper() for x in integrals])
     bounds = [x.upper() for x in entries(grown)]
@@ -638,18 +673,20 @@ def _bound_by_number(jacobian: Any, integrals: Sequence[Any], length: Any) -> li
 def _measure_defect(
     step: Advance, d: Sequence[Sequence[Any]], order: int, tolerance: float
 ) -> Advance:
-    """Note the integral of the last term of the defect; Refused: it is too large.
+    """Note the integral of the last term of the defect.
 
-    The terms below it are what the balls of numbers bring, which shorter steps do not
-    lessen.
+    Raises Refused where it is too large. The terms below it come from the balls of
+    numbers; shorter steps do not make these smaller.
     """
     size = len(d[0])
     last = max(float(row[-1] * step.length**size / size) for row in d)
     step = step._replace(defect=last)
     if not last <= tolerance:
         excess = last / tolerance
-        shorter = 0.9 * excess ** (-1.0 / order) if excess < math.inf else 0.5
-        raise Refused("the defect is too large", max(shorter, 0.2))
+        shorter = 0.5
+        if excess < math.inf:
+            shorter = max(DEFECT_MARGIN * excess ** (-1.0 / order), LEAST_SHORTER)
+        raise Refused("the defect is too large", shorter)
     return step
 
 
@@ -658,27 +695,27 @@ def _fundamental(j: Sequence[Any], half: Any, order: int) -> list[Any]:
 
     V is nearly a fundamental matrix of J.
     """
-    middles = shift([_middles(x) for x in j], -float(half))
-    v = [np.eye(len(middles[0]))]
+    about_middle = shift([_to_floats(matrix) for matrix in j], -float(half))
+    v = [np.eye(len(about_middle[0]))]
     for k in range(order):
-        terms = [middles[i] @ v[k - i] for i in range(min(k, len(j) - 1) + 1)]
+        terms = [about_middle[i] @ v[k - i] for i in range(min(k, len(j) - 1) + 1)]
         v.append(np.sum(terms, axis=0) / (k + 1))
     return [arb_mat(matrix.tolist()) for matrix in v]
 
 
 def _remainder(j: Sequence[Any], step: Advance) -> Any:
     """Enclose J V - V' in the whole step."""
-    n = len(step.p)
     u = between(-step.half, step.half)
-    zero = arb_mat(n, n, [0] * (n * n))
-    about_middle = shift(step.v, step.half)
-    degree = len(step.v) - 1
-    remainder = zero
-    for k in reversed(range(len(j) + degree)):
-        some = range(max(0, k - degree), min(k, len(j) - 1) + 1)
-        term = sum((j[i] * about_middle[k - i] for i in some), zero)
+    n = len(step.p)
+    v = shift(step.v, step.half)  # about the middle, as j
+    degree = len(v) - 1
+    remainder = zeros(n)
+    for k in reversed(range(len(j) + degree)):  # coefficients of powers of u
+        term = zeros(n)
+        for i in range(max(0, k - degree), min(k, len(j) - 1) + 1):
+            term = term + j[i] * v[k - i]
         if k < degree:
-            term = term - about_middle[k + 1] * (k + 1)
+            term = term - v[k + 1] * (k + 1)
         remainder = remainder * u + term
     return remainder
 
@@ -692,28 +729,26 @@ def _values_of(j: Sequence[Any], half: Any) -> Any:
 def _check_tube(step: Advance, tolerance: float) -> Advance:
     """Return a step with the tube that is reached.
 
-    Refused: the error may leave its tube.
+    Raises Refused where the error may leave its tube.
     """
+    moving = step.begin.moving
     s = between(0, step.length)
-    spread = step.begin.spread(step.flow(s))
-    reached = entries(spread + step.w)
-    pairs = list(zip(reached, step.tube, strict=True))[: step.begin.moving]
+    reached = entries(step.begin.spread(step.flow(s)) + step.w)
+    pairs = list(zip(reached, step.tube, strict=True))[:moving]
     if all(x.is_finite() and x < e.rad() for x, e in pairs):
-        return step._replace(tube=[arb(0, x.upper()) for x in reached])
-    # Numbers of ranges do not move, but what they move counts from the first step on:
-    # at the end of the step, as V in all of a long step is much wider than it is.
+        return step._replace(tube=around_zero(reached))
+    # A wider tube may do, unless the error grows much in the step: by more than the
+    # remainder of V makes the set grow. Numbers of ranges do not move, but what they
+    # move counts from the first step on: at the end of the step, as V in all of a long
+    # step is much wider than it is.
+    at_begin = step.begin.spread()
     at_end = step.begin.spread(step.flow(step.length))
-    widest = max(
-        _largest(spread_then, step.begin.moving)
-        for spread_then in (step.begin.spread(), at_end)
-    )
-    grows = max(map(float, entries(step.w)))
-    is_slow = grows < 10.0 * tolerance + REMAINDER_GROWTH * widest
+    widest = max(_largest(at_begin, moving), _largest(at_end, moving))
+    growth = max(map(float, entries(step.w)))
     wider = None
-    if is_slow:
-        moving = [2 * x for x in reached[: step.begin.moving]]
-        wider = [arb(0, x.upper()) for x in moving] + step.tube[step.begin.moving :]
-    raise Refused("the error may leave the tube: it grows too fast", 0.6, wider)
+    if growth < SLOW_GROWTH * tolerance + REMAINDER_GROWTH * widest:
+        wider = around_zero([2 * x for x in reached[:moving]]) + step.tube[moving:]
+    raise Refused("the error may leave the tube: it grows too fast", SHORTER, wider)
 
 
 def _largest(bounds: Any, count: int) -> float:
@@ -723,20 +758,20 @@ def _largest(bounds: Any, count: int) -> float:
 
 def _weights(jacobian: Any) -> list[Any]:
     """Return weights of a norm in which |J| is small: nearly its Perron vector."""
-    size = np.abs(_middles(jacobian))
+    size = np.abs(_to_floats(jacobian))
     weights = np.ones(len(jacobian.tolist()))
     if not np.all(np.isfinite(size)):
         raise Refused(UNBOUNDED)
-    for _ in range(20):
-        weights = size @ weights + 1e-3 * weights
-        weights = np.maximum(weights / weights.max(), 1e-9)
+    for _ in range(WEIGHT_STEPS):
+        weights = size @ weights + KEPT_WEIGHT * weights
+        weights = np.maximum(weights / weights.max(), LEAST_WEIGHT)
     return [arb(x) for x in weights.tolist()]
 
 
 def region_at_end(step: Advance, *, boxed: bool = False) -> Region:
     """Return where the solution is at the end of a step, in axes that fit it.
 
-    What is `boxed` has the axes of its numbers.
+    A region that is `boxed` has the axes of its numbers.
     """
     h = step.length
     start = step.begin
@@ -744,12 +779,10 @@ def region_at_end(step: Advance, *, boxed: bool = False) -> Region:
     reached = [p(h) for p in step.p]
     moved = flow * start.axes
     c = flow * start.c
-    rounding = column([x.rad() for x in reached])
-    error = magnitude(c - c.mid()) * start.a + step.w + rounding
-    centre = [x.mid() for x in reached]
+    error = magnitude(c - c.mid()) * start.a + step.w + column(radii(reached))
+    centre = middles(reached)
     if boxed:
-        n = len(centre)
-        axes = arb_mat(n, n, [0] * (n * n)) + 1
+        axes = identity(len(centre))
         b = magnitude(magnitude(moved) * start.b + error)
     else:
         axes = fit_axes(moved, start.b, [float(x) for x in step.weights])
@@ -765,20 +798,18 @@ def _loss(step: Advance) -> float:
     """
 
     def size(spread: Any) -> float:
-        rows = zip(entries(spread), step.weights, strict=True)
-        return max(float(x / weight) for x, weight in islice(rows, step.begin.moving))
+        weighted = zip(entries(spread), step.weights, strict=True)
+        sizes = [float(x / weight) for x, weight in weighted]
+        return max(sizes[: step.begin.moving])
 
     old = size(step.begin.spread(step.flow(step.length)))
     return size(step.w) / old if old else 0.0
 
 
 def fit_axes(moved: Any, b: Any, scale: Sequence[float]) -> Any:
-    """Return axes for a set moved b: its own, or orthogonal ones.
-
-    Orthogonal ones are taken where its own are skew.
-    """
+    """Return axes for a set moved b: its own, or orthogonal ones if these are skew."""
     scales = np.array(scale)[:, None]
-    guide = _middles(moved) / scales
+    guide = _to_floats(moved) / scales
     lengths = np.linalg.norm(guide, axis=0)
     is_skew = not np.all(lengths > 0.0)
     if not is_skew:
@@ -796,7 +827,7 @@ def _tube(region: Region, room: float, tolerance: float) -> list[Any]:
     """Return a tube with some room around a region; what never changes needs none."""
     spread = entries(region.spread())
     moving = [room * (x + tolerance) for x in spread[: region.moving]]
-    return [arb(0, x.upper()) for x in (*moving, *spread[region.moving :])]
+    return around_zero([*moving, *spread[region.moving :]])
 
 
 class ProvenSteps:
@@ -821,19 +852,18 @@ class ProvenSteps:
         tolerance: float,
         order: int,
     ) -> None:
-        self._f, self._jacobian = f, jacobian
+        self._f = f
+        self._jacobian = jacobian
         self._region = start
         self._end = end
         self._tolerance = tolerance
         self._order = order
         self._span = end - start.time
-        self._room = 3  # of a tube
-        self._factor = 0.4  # of a step by its longest
-        # steps: the last, the longest next
-        self._usual = self._span
-        self._most = math.inf
-        self._cruise = self._span  # last step before a kink was near
-        self.kinks: list[tuple[float, float]] = []  # spans of time across kinks [s]
+        self._room: float = ROOM  # of the next tube
+        self._factor = FIRST_FACTOR  # of the next step by its longest
+        self._usual = self._span  # length of steps of late
+        self._cruise = self._span  # the same before a kink was near
+        self._most = math.inf  # largest length of the next step
 
     def __iter__(self) -> Iterator[Advance]:
         """Yield the steps."""
@@ -849,57 +879,65 @@ class ProvenSteps:
     def _smooth_step(self) -> Advance:
         """Prove a step of Taylor series.
 
-        KinkMet where one lies ahead within KINK_STEP.
+        Raises KinkMet where a kink is so near that no step is KINK_STEP long.
         """
         region = self._region
         tolerance = self._tolerance
-        order = self._order
-        p = approximate(self._f, self._jacobian, region, order)
-        sizes = [
-            (k, max(float(row[k].abs_upper()) for row in p)) for k in (order - 1, order)
-        ]
-        longest = min(
-            [(tolerance / x) ** (1.0 / k) for k, x in sizes if x], default=self._usual
-        )
+        p = approximate(self._f, self._jacobian, region, self._order)
+        polynomials = list(map(arb_poly, p))
+        longest = self._longest_step(p)
         wanted = self._factor * longest
-        tries = 0
-        h = min(wanted, 4.0 * self._usual, self._most)
+        h = min(wanted, GROWTH * self._usual, self._most)
         is_free = h == wanted or self._most < math.inf  # no kink has made it short
         tube = _tube(region, self._room, tolerance)
+        tries = 0
         while True:
             target = region.time + h
-            if region.time + 1.01 * h > self._end:
+            if region.time + END_MARGIN * h > self._end:
                 target = self._end
-            step = Advance(region, target, list(map(arb_poly, p)), tube)
+            step = Advance(region, target, polynomials, tube)
             try:
-                step = prove(self._f, self._jacobian, step, order, tolerance)
-                less_lossy = self._less_lossy(step)
-                is_free = is_free and less_lossy.end == step.end
-                step = less_lossy
+                proven = self._prove(step)
+                step = self._less_lossy(proven)
                 break
             except KinkMet as kink:
-                tube = _tube(region, 3, tolerance)
-                self._room = 3
+                self._room = ROOM
+                tube = _tube(region, ROOM, tolerance)
                 h = self._clear_length(step._replace(tube=tube))
                 is_free = False
-                if h < KINK_STEP * self._span or region.time + h == region.time:
+                if self._is_too_short(h, KINK_STEP):
                     raise kink from None
             except (ArithmeticError, ValueError) as error:
                 why = error if isinstance(error, Refused) else Refused(UNBOUNDED)
-                if why.wider is not None and tries < 4:
+                if why.wider is not None and tries < TUBE_TRIES:
                     tube = why.wider
                     tries += 1
-                    self._room = min(2 * self._room, 100)
+                    self._room = min(2 * self._room, MOST_ROOM)
                     continue
                 h = why.shorter * (target - region.time)
                 tries = 0
                 self._most = 0.0
-                self._room = 3
-                tube = _tube(region, self._room, tolerance)
-                if h < LEAST_STEP * self._span or region.time + h == region.time:
+                self._room = ROOM
+                tube = _tube(region, ROOM, tolerance)
+                if self._is_too_short(h, LEAST_STEP):
                     raise why from None
+        is_free = is_free and step.end == proven.end
         self._plan(step.end - region.time, longest, step.defect, is_free=is_free)
         return step
+
+    def _longest_step(self, p: Sequence[Sequence[Any]]) -> float:
+        """Return the step at which a last term of p is as large as the tolerance."""
+        lengths = []
+        for k in (self._order - 1, self._order):
+            size = max(float(row[k].abs_upper()) for row in p)
+            if size:
+                lengths.append((self._tolerance / size) ** (1.0 / k))
+        return min(lengths, default=self._usual)
+
+    def _is_too_short(self, h: float, least: float) -> bool:
+        """Whether a step is below a share of the whole time, or lost in rounding."""
+        time = self._region.time
+        return h < least * self._span or time + h == time
 
     def _less_lossy(self, step: Advance) -> Advance:
         """Return a step, or a shorter one if it widens the set by much less.
@@ -909,19 +947,18 @@ class ProvenSteps:
         """
         if not self._is_lossy(step):
             return step
-        moving = [TIGHT * x for x in step.tube[: step.begin.moving]]
-        tight = [*moving, *step.tube[step.begin.moving :]]
+        moving = step.begin.moving
+        tight = [TIGHT * x for x in step.tube[:moving]] + step.tube[moving:]
         with contextlib.suppress(ArithmeticError, ValueError):
             step = self._prove(step._replace(tube=tight))
         while self._is_lossy(step):
-            h = 0.6 * (step.end - step.begin.time)
-            tube = _tube(step.begin, 3, self._tolerance)
-            shorter = step._replace(end=step.begin.time + h, tube=tube)
+            end = step.begin.time + SHORTER * (step.end - step.begin.time)
+            tube = _tube(step.begin, ROOM, self._tolerance)
             try:
-                shorter = self._prove(shorter)
+                shorter = self._prove(step._replace(end=end, tube=tube))
             except (ArithmeticError, ValueError):
                 return step
-            if _loss(shorter) > 0.2 * _loss(step):
+            if _loss(shorter) > MUCH_LESS * _loss(step):
                 return step
             step = shorter
         return step
@@ -931,25 +968,34 @@ class ProvenSteps:
         widened = max(map(float, entries(step.w)))
         return widened > UNSEEN * self._tolerance and _loss(step) > LOSS
 
-    def _prove(self, step: Advance) -> Advance:
-        return prove(self._f, self._jacobian, step, self._order, self._tolerance)
+    def _prove(self, step: Advance, *, across_kink: bool = False) -> Advance:
+        order = 1 if across_kink else self._order
+        return prove(
+            self._f,
+            self._jacobian,
+            step,
+            order,
+            self._tolerance,
+            across_kink=across_kink,
+        )
 
     def _plan(
         self, taken: float, longest: float, defect: float, *, is_free: bool
     ) -> None:
-        """Choose what the next step is made from."""
+        """Choose what the length of the next step is made from."""
         if self._region.time + taken >= self._end:
             return
-        self._usual = max(taken, 0.1 * self._usual)
+        self._usual = max(taken, LEAST_USUAL * self._usual)
         if self._most < math.inf:
             self._most = REGAIN * taken
         if not is_free:
             return
         self._cruise = self._usual
-        ratio = (
-            (0.5 * self._tolerance / defect) ** (1.0 / self._order) if defect else 1.3
-        )
-        self._factor = taken / longest * min(max(ratio, 0.7), 1.3)
+        change = MOST_CHANGE
+        if defect:
+            change = (DEFECT_AIM * self._tolerance / defect) ** (1.0 / self._order)
+        change = min(max(change, LEAST_CHANGE), MOST_CHANGE)
+        self._factor = taken / longest * change
 
     def _clear_length(self, step: Advance) -> float:
         """Return how long no kink is near, nearly, by halving a step that has one."""
@@ -960,9 +1006,7 @@ class ProvenSteps:
             try:
                 step.enclose(self._f, 2, step.tube, (arb(0), arb(middle)))
                 low = middle
-            except KinkMet:
-                high = middle
-            except (ArithmeticError, ValueError):
+            except (ArithmeticError, ValueError):  # KinkMet is one
                 high = middle
             if low > 0.9 * high:
                 break
@@ -971,11 +1015,11 @@ class ProvenSteps:
     def _cross_kink(self, kink: KinkMet) -> Iterator[Advance]:
         """Yield steps across a kink, until a step of series is proven.
 
-        Each is twice as long as the one before.
+        Each is twice as long as the one before, unless it loses much.
         """
-        begin = self._region.time
         h = KINK_STEP * self._span
-        factor, cruise = self._factor, self._cruise
+        factor = self._factor
+        cruise = self._cruise
         for _ in range(KINK_STEPS):
             step = self._kink_step(h, kink)
             yield step
@@ -995,43 +1039,40 @@ class ProvenSteps:
             break
         else:
             raise Refused(f"{kink}, for longer than {KINK_STEPS} steps")
-        self.kinks.append((begin, step.end))
-        self._usual, self._cruise, self._factor = cruise, cruise, factor
+        self._usual = cruise
+        self._cruise = cruise
+        self._factor = factor
 
     def _kink_step(self, longest: float, kink: KinkMet) -> Advance:
         """Prove a step across a kink by a straight line p."""
-        region = self._region
+        time = self._region.time
         h = longest
         for _ in range(KINK_HALVINGS):
-            target = min(self._end, region.time + h)
-            if target == region.time:
+            target = min(self._end, time + h)
+            if target == time:
                 break
-            half = (arb(target) - arb(region.time)) / 2
-            time = arb(region.time)
-            first = self._f(time, *region.centre)
-            middle = [
-                x + half * arb(slope).mid()
-                for x, slope in zip(region.centre, first, strict=True)
-            ]
-            slopes = self._f(time + half, *middle)
-            p = [
-                arb_poly([x, arb(s).mid()])
-                for x, s in zip(region.centre, slopes, strict=True)
-            ]
-            line = Advance(region, target, p, _tube(region, 3, self._tolerance))
-            for _ in range(4):
+            line = self._line(target)
+            for _ in range(TUBE_TRIES):
                 try:
-                    return prove(
-                        self._f,
-                        self._jacobian,
-                        line,
-                        1,
-                        self._tolerance,
-                        across_kink=True,
-                    )
+                    return self._prove(line, across_kink=True)
                 except Refused as why:
                     if why.wider is None:
                         break
                     line = line._replace(tube=why.wider)
             h *= 0.25
         raise kink
+
+    def _line(self, target: float) -> Advance:
+        """Return a step to a time along the slope in its middle."""
+        region = self._region
+        time = arb(region.time)
+        half = (arb(target) - time) / 2
+        slopes = map(arb, self._f(time, *region.centre))
+        middle = []
+        for x, slope in zip(region.centre, slopes, strict=True):
+            middle.append(x + half * slope.mid())
+        slopes = map(arb, self._f(time + half, *middle))
+        p = []
+        for x, slope in zip(region.centre, slopes, strict=True):
+            p.append(arb_poly([x, slope.mid()]))
+        return Advance(region, target, p, _tube(region, ROOM, self._tolerance))

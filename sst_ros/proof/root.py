@@ -6,21 +6,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from sst_ros.proof.balls import PRECISION, arb, arb_mat, column, entries, magnitude
+from sst_ros.proof.balls import (
+    PRECISION,
+    arb,
+    column,
+    entries,
+    from_columns,
+    magnitude,
+    middles,
+    rows_of,
+)
 from sst_ros.proof.enclosure import Function, Refused
 
+# Newton's method doubles the digits in a step: a guess in doubles needs two or three.
+ROOT_NEWTON_STEPS = 6
 INFLATIONS = 6  # of the box in which the root is looked for
+LEAST_RADIUS = 2.0 ** (8 - PRECISION)  # of that box: rounding alone is not wider
 
 
 class Root(NamedTuple):
-    """Where the unknowns of equations are.
+    """The unknowns of equations, for all parameters in their balls.
 
-    They are in middle + slopes (parameters - their middles) +- remainder.
+    They lie in middle + slopes (parameters - their middles) +- remainder.
     """
 
     middle: list[Any]
     slopes: Any
     remainder: list[Any]
+
+
+class _Linearization(NamedTuple):
+    """Equations at unknowns and parameters."""
+
+    values: Any  # a column
+    by_unknowns: Any  # a row for each equation
+    by_parameters: Any
 
 
 def krawczyk(
@@ -33,43 +53,51 @@ def krawczyk(
     to exist and to be the only one in a box.
     """
     n = len(guess)
-    middles = [x.mid() for x in parameters]
-    off = column([x - middle for x, middle in zip(parameters, middles, strict=True)])
+    fixed = middles(parameters)
+    differences = [x - middle for x, middle in zip(parameters, fixed, strict=True)]
+    off = column(differences)
 
-    def evaluate(unknown: Any, parameter_values: Sequence[Any]) -> tuple[Any, Any, Any]:
-        flat = [arb(x) for x in run(*entries(unknown), *parameter_values)]
-        rows = [
-            [flat[n * (j + 1) + i] for j in range(n + len(parameters))]
-            for i in range(n)
-        ]
-        by_unknown = arb_mat([row[:n] for row in rows])
-        return column(flat[:n]), by_unknown, arb_mat([row[n:] for row in rows])
+    def linearize(unknowns: Any, parameter_values: Sequence[Any]) -> _Linearization:
+        numbers = list(map(arb, run(*entries(unknowns), *parameter_values)))
+        values, *slopes = rows_of(numbers, n)
+        return _Linearization(
+            column(values), from_columns(slopes[:n]), from_columns(slopes[n:])
+        )
 
-    middle = column([arb(x) for x in guess])
-    for _ in range(6):  # Newton
-        values, slopes, _ = evaluate(middle, middles)
-        inverse = slopes.mid().inv().mid()
-        middle = (middle - inverse * values).mid()
-    # for all parameters
-    values = evaluate(middle, middles)[0] + evaluate(middle, parameters)[2] * off
-    step = inverse * values
-    least = arb(2) ** (8 - PRECISION)
-    reach = entries(magnitude(step))
+    root = column(list(map(arb, guess)))
+    for _ in range(ROOT_NEWTON_STEPS):
+        at_root = linearize(root, fixed)
+        inverse = at_root.by_unknowns.mid().inv().mid()
+        root = (root - inverse * at_root.values).mid()
+    # Newton's step from there, for all parameters.
+    residual = linearize(root, fixed).values
+    step = inverse * (residual + linearize(root, parameters).by_parameters * off)
+    bounds = entries(magnitude(step))
     for _ in range(INFLATIONS):
-        radii = [(2 * x + least).upper() for x in reach]
-        box = column([arb(m, r) for m, r in zip(entries(middle), radii, strict=True)])
-        _, slopes, by_parameters = evaluate(box, parameters)
-        image = middle - step - (inverse * slopes - 1) * (box - middle)
-        pairs = zip(entries(box), entries(image), strict=True)
-        if all(wide.contains_interior(narrow) for wide, narrow in pairs):
+        box = column(
+            [
+                arb(middle, (2 * bound + arb(LEAST_RADIUS)).upper())
+                for middle, bound in zip(entries(root), bounds, strict=True)
+            ]
+        )
+        in_box = linearize(box, parameters)
+        image = root - step - (inverse * in_box.by_unknowns - 1) * (box - root)
+        if _contains_interior(box, image):
             break
-        reach = entries(magnitude(image - middle))
+        bounds = entries(magnitude(image - root))
     else:
         raise Refused(reason)
-    back = slopes.inv()
-    linear = -1 * (back * by_parameters)
-    kept = linear.mid()
-    remainder = magnitude(back * evaluate(middle, middles)[0]) + magnitude(
-        linear - kept
-    ) * magnitude(off)
-    return Root(entries(middle), kept, entries(remainder))
+    back = in_box.by_unknowns.inv()
+    slopes = -1 * (back * in_box.by_parameters)
+    exact_slopes = slopes.mid()
+    remainder = magnitude(back * residual)
+    remainder += magnitude(slopes - exact_slopes) * magnitude(off)
+    return Root(entries(root), exact_slopes, entries(remainder))
+
+
+def _contains_interior(box: Any, image: Any) -> bool:
+    """Whether a column of balls lies in the interior of another one."""
+    for outer, inner in zip(entries(box), entries(image), strict=True):
+        if not outer.contains_interior(inner):
+            return False
+    return True

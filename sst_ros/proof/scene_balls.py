@@ -12,14 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
-from itertools import islice
 from typing import Any, NamedTuple
 
 from sst_ros.dynamics import kernel
 from sst_ros.errors import refusal, refuse_unless
 from sst_ros.mechanism import generic_math as gm
 from sst_ros.mechanism.generic_math import Triple, cross3, dot3, triple
-from sst_ros.programs.expression import Expression, Program, mark_present, trace
+from sst_ros.programs.expression import (
+    Expression,
+    Program,
+    divide,
+    mark_present,
+    trace,
+)
 from sst_ros.proof import enclosure
 from sst_ros.proof.balls import PRECISION, arb, between, half_unit, number_ball
 from sst_ros.scene.bodies import ABOUT_CENTRE, Base, Inertia, Link, shift_inertia
@@ -83,7 +88,7 @@ class Derived(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a traced function is given of a scene, in symbols."""
+    """What a traced function receives of a scene, in symbols."""
 
     model: kernel.Model
     axes: Axes
@@ -109,21 +114,20 @@ class WrittenDocument(NamedTuple):
 def _unconvert(document_node: Any, place: Place, texts: dict[Place, str]) -> Any:
     """Undo the conversions below a node; collect the texts of its numbers."""
     if isinstance(document_node, tuple):
-        return tuple(
-            _unconvert(x, (*place, i), texts) for i, x in enumerate(document_node)
-        )
+        items = enumerate(document_node)
+        return tuple(_unconvert(item, (*place, i), texts) for i, item in items)
     if not isinstance(document_node, Section):
         return document_node
     for name, written in texts_of(document_node).items():
         _collect_texts(written, (*place, name), texts)
     fields = vars(document_node) | converted_of(document_node)
-    return build_unchecked(
-        type(document_node),
-        {name: _unconvert(x, (*place, name), texts) for name, x in fields.items()},
-    )
+    for name, value in fields.items():
+        fields[name] = _unconvert(value, (*place, name), texts)
+    return build_unchecked(type(document_node), fields)
 
 
 def _collect_texts(written: Any, place: Place, texts: dict[Place, str]) -> None:
+    """Collect the texts of numbers, or of lists of them, from a place on."""
     if isinstance(written, (list, tuple)):
         for i, number in enumerate(written):
             _collect_texts(number, (*place, i), texts)
@@ -131,7 +135,7 @@ def _collect_texts(written: Any, place: Place, texts: dict[Place, str]) -> None:
         texts[place] = str(written)
 
 
-# Conversions of a document: of symbols, whose zeros alone are floats.
+# Conversions of a document in symbols; only its zeros are floats.
 
 
 def convert(scene: Any, degree: Any) -> Derived:
@@ -143,24 +147,18 @@ def convert(scene: Any, degree: Any) -> Derived:
             corners: Place = (*place, "v")
             values[corners] = _triangle(*arcs)
         if isinstance(section, Link) and section.inertia_about == ABOUT_CENTRE:
-            numbers = shift_inertia(section.inertia, section.mass, section.centre)
-            named = dict(zip(Inertia.SPECS, numbers, strict=True))
-            shifted: Place = (*place, "inertia")
-            values[shifted] = build_unchecked(Inertia, named)
+            moments = shift_inertia(section.inertia, section.mass, section.centre)
+            named_moments = dict(zip(Inertia.SPECS, moments, strict=True))
+            inertia: Place = (*place, "inertia")
+            values[inertia] = build_unchecked(Inertia, named_moments)
     converted = rebuild(scene, values)
     return Derived(converted, _axes_of(converted, degree))
 
 
-def _below(place: Place, name: str) -> Place:
-    return (*place, name)
-
-
 def _triangle(arc_12: Any, arc_23: Any, arc_31: Any) -> tuple[Triple, Triple, Triple]:
-    """Return the corners of a spherical triangle of given arcs.
-
-    They are as `Base` describes them.
-    """
-    sine, cosine = gm.sin(arc_12), gm.cos(arc_12)
+    """Return the corners of a spherical triangle by its arcs, as `Base` has them."""
+    sine = gm.sin(arc_12)
+    cosine = gm.cos(arc_12)
     x = gm.cos(arc_31)
     y = (gm.cos(arc_23) - x * cosine) / sine
     z = gm.sqrt(1.0 - x * x - y * y)
@@ -177,7 +175,8 @@ def _axes_of(scene: Any, degree: Any) -> Axes:
     for direction in scene.base.v:
         length = _length(direction)
         v.append(triple(x / length for x in direction))
-    w, arcs = [], []
+    w = []
+    arcs = []
     for first, second in ((0, 1), (1, 2), (2, 0)):
         normal = cross3(v[first], v[second])
         sine = _length(normal)
@@ -187,9 +186,8 @@ def _axes_of(scene: Any, degree: Any) -> Axes:
     e = [(0.0, 1.0, 0.0)]
     for angle in (alpha_12, alpha_12 + alpha_23):
         e.append((-gm.sin(angle), gm.cos(angle), 0.0))
-    return Axes(
-        tuple(v), tuple(w), tuple(e), tuple(arcs), degree * scene.workspace.beta_max_deg
-    )
+    beta_max = degree * scene.workspace.beta_max_deg
+    return Axes(tuple(v), tuple(w), tuple(e), tuple(arcs), beta_max)
 
 
 def damping_ball(restitution: Any, impact_rate: Any) -> Any:
@@ -210,7 +208,8 @@ def _langevin_bound(y: Any, side: int) -> Any:
     if not y > 0:
         return arb(0)
     # x/3 > coth x - 1/x > 1 - 1/x for x > 0.
-    low, high = (3 * y).mid(), (1 / (1 - y)).upper()
+    low = (3 * y).mid()
+    high = (1 / (1 - y)).upper()
     for _ in range(PRECISION):
         middle = ((low + high) / 2).mid()
         value = middle.coth() - 1 / middle
@@ -239,22 +238,8 @@ def range_balls(
     none.
     """
     balls: dict[Place, Any] = {}
-    numbers = leaves(document.scene)
     for key, width in ranges.items():
-        try:
-            fields = [
-                place
-                for place, _, _ in find_fields(document.scene, key, components=True)
-            ]
-        except ValueError as error:
-            raise refusal(origin, "ranges", key, str(error)) from None
-        places = [
-            p for p in numbers if any(p[: len(field)] == field for field in fields)
-        ]
-        refuse_unless(
-            origin,
-            ("ranges", key, bool(places), "must name numbers that the scene has"),
-        )
+        places = _places_of(key, document, origin)
         for place in places:
             _refuse_no_effect(key, place, own_torque=own_torque, origin=origin)
         for place, ball in _balls_of(key, width, places, document, origin):
@@ -263,6 +248,21 @@ def range_balls(
             )
             balls[place] = ball
     return balls
+
+
+def _places_of(key: str, document: WrittenDocument, origin: str) -> list[Place]:
+    """Return the places of all numbers of the field, or fields, that a key names."""
+    try:
+        fields = list(find_fields(document.scene, key, components=True))
+    except ValueError as error:
+        raise refusal(origin, "ranges", key, str(error)) from None
+    places = []
+    for place in leaves(document.scene):
+        if any(place[: len(field)] == field for field, _, _ in fields):
+            places.append(place)
+    requirement = "must name numbers that the scene has"
+    refuse_unless(origin, ("ranges", key, bool(places), requirement))
+    return places
 
 
 def _refuse_no_effect(key: str, place: Place, *, own_torque: bool, origin: str) -> None:
@@ -281,39 +281,39 @@ def _balls_of(
     document: WrittenDocument,
     origin: str,
 ) -> Iterator[tuple[Place, Any]]:
+    """Yield the ball of each number of a range, by place."""
     numbers = leaves(document.scene)
+    texts = document.texts
     name = f"ranges[{key}]"
     if width == "digits":
-        written = [place for place in places if place in document.texts]
+        written = [place for place in places if place in texts]
         requirement = (
             "has no written digits: give a half-width, or the scene as a document"
         )
         refuse_unless(origin, (name, width, bool(written), requirement))
         for place in written:
-            text = document.texts[place]
-            yield (
-                place,
-                number_ball(numbers[place], text) + arb(0, half_unit(text).upper()),
-            )
+            text = texts[place]
+            doubt = arb(0, half_unit(text).upper())
+            yield place, number_ball(numbers[place], text) + doubt
         return
     requirement = 'must be a half-width >= 0, an interval (low, high), or "digits"'
     if isinstance(width, (tuple, list)):
         is_interval = len(width) == 2 and all(map(_is_bounded, width))
-        refuse_unless(
-            origin, (name, width, is_interval and width[0] <= width[1], requirement)
-        )
+        is_interval = is_interval and width[0] <= width[1]
+        refuse_unless(origin, (name, width, is_interval, requirement))
         low, high = map(float, width)
         for place in places:
-            inside = low <= numbers[place] <= high
-            number = f"must hold the number of the scene, {numbers[place]}"
-            refuse_unless(origin, (name, width, inside, number))
-            yield place, between(arb(low), arb(high)).union(number_ball(numbers[place]))
+            number = numbers[place]
+            inside = low <= number <= high
+            must_hold = f"must hold the number of the scene, {number}"
+            refuse_unless(origin, (name, width, inside, must_hold))
+            yield place, between(arb(low), arb(high)).union(number_ball(number))
         return
     is_width = _is_bounded(width) and float(width) >= 0.0
     refuse_unless(origin, (name, width, is_width, requirement))
     for place in places:
-        digits = document.texts.get(place)
-        yield place, number_ball(numbers[place], digits) + arb(0, float(width))
+        ball = number_ball(numbers[place], texts.get(place))
+        yield place, ball + arb(0, float(width))
 
 
 def _is_bounded(number: Any) -> bool:
@@ -345,16 +345,18 @@ class NumberReading(NamedTuple):
         return not (self.read - self.written).is_zero()
 
     @property
+    def is_zero(self) -> bool:
+        """Whether the number is exactly zero, read and written."""
+        return bool(self.read.is_zero()) and not self.differs
+
+    @property
     def middle(self) -> Any:
         """Return the number between both."""
         return (self.read + self.written) / 2
 
     @property
     def half(self) -> Any:
-        """Return half of what the written number has more.
-
-        Exactly 0 if it is the other.
-        """
+        """Return half of written - read; exactly 0 where these are equal."""
         return (self.written - self.read) / 2
 
     @property
@@ -364,16 +366,20 @@ class NumberReading(NamedTuple):
 
 
 class _Constants:
-    """Numbers of a program that no range touches, by place.
+    """Numbers of a program that no range touches, by place: middle + half r.
 
-    They are balls, one for r = 0 and a slope.
+    Args:
+        letter: first one of the names of their symbols.
+        readings: the numbers. Each is a symbol, or two where it is read as another
+            number than is written.
+
     """
 
     def __init__(self, letter: str, readings: Mapping[Place, NumberReading]) -> None:
-        self.balls: list[Any] = []
-        self._slopes: dict[Place, bool] = {}
+        self.balls: list[Any] = []  # that the symbols stand for
+        self._has_slope: dict[Place, bool] = {}
         for place, reading in readings.items():
-            self._slopes[place] = reading.differs
+            self._has_slope[place] = reading.differs
             self.balls.append(reading.middle)
             if reading.differs:
                 self.balls.append(reading.half)
@@ -386,7 +392,7 @@ class _Constants:
         """Return the numbers by place, in symbols of their names and of r."""
         remaining_symbols = iter(symbols)
         numbers = {}
-        for place, has_slope in self._slopes.items():
+        for place, has_slope in self._has_slope.items():
             number = next(remaining_symbols)
             if has_slope:
                 number = number + next(remaining_symbols) * reading
@@ -415,53 +421,33 @@ class SceneBalls:
         profile: TorqueProfile | None,
         ranges: Mapping[Place, Any],
     ) -> None:
-        document = WrittenDocument.of(scene)
-        written = document.scene
-        texts = dict(document.texts)
-        if isinstance(profile, SineTorque) and profile != scene.torque:
-            written = rebuild(written, {("torque",): profile})
-            texts = {place: x for place, x in texts.items() if place[0] != "torque"}
-        readings: dict[Place, NumberReading] = {}
-        for place, number in leaves(written).items():
-            readings[place] = NumberReading.of(number, texts.get(place))
-        varied = [place for place in ranges if place[0] != "initial"]
+        self.scene = scene
+        written, readings = _read(scene, profile)
         ranges = dict(ranges)
         if written.stroke.restitution is not None:
-            impact = [readings.pop(place) for place in RESTITUTION]
-            if any(place in ranges for place in RESTITUTION):
-                varied = [*(p for p in varied if p not in RESTITUTION), DAMPING]
-                rates = zip(RESTITUTION, impact, strict=True)
-                ranges[DAMPING] = damping_ball(
-                    *(ranges.get(p, x.ball) for p, x in rates)
-                )
-            else:
-                as_read, as_written = zip(*impact, strict=True)
-                readings[DAMPING] = NumberReading(
-                    damping_ball(*as_read), damping_ball(*as_written)
-                )
+            _make_damping(readings, ranges)
             written = rebuild(written, dict.fromkeys(RESTITUTION))
-        self.scene = scene
-        self._varied = {place: ranges[place] for place in varied}
         self._document = written
-        self._initial = {}
+        # Numbers by place: ranges, those of the start, and all others that act.
+        self._varied: dict[Place, Any] = {}
+        for place, ball in ranges.items():
+            if place[0] != "initial":
+                self._varied[place] = ball
+        self._initial: dict[Place, Any] = {}
+        self._constants: dict[Place, NumberReading] = {}
         for place, reading in readings.items():
             if place[0] == "initial":
                 self._initial[place] = ranges.get(place, reading)
-        settled = {
-            p: x for p, x in readings.items() if p not in ranges and p[0] != "initial"
-        }
-        settled = {
-            p: x for p, x in settled.items() if not (x.read.is_zero() and not x.differs)
-        }
-        settled[DEGREE] = NumberReading(arb.pi() / 180, arb.pi() / 180)
-        self._symbols = settled
+            elif place not in ranges and not reading.is_zero:
+                self._constants[place] = reading
+        self._constants[DEGREE] = NumberReading(arb.pi() / 180, arb.pi() / 180)
         self._settled = self._convert_in_balls()
-        two = any(x.differs for x in settled.values())
-        two = two or any(
-            isinstance(x, NumberReading) and x.differs for x in self._initial.values()
+        numbers = [*self._constants.values(), *self._initial.values()]
+        has_readings = any(
+            isinstance(number, NumberReading) and number.differs for number in numbers
         )
-        names = [f"p{i}" for i in range(len(varied))]
-        self.inputs = (*names, READING) if two else tuple(names)
+        names = tuple(f"p{i}" for i in range(len(self._varied)))
+        self.inputs = (*names, READING) if has_readings else names
 
     @property
     def varied_balls(self) -> list[Any]:
@@ -477,39 +463,44 @@ class SceneBalls:
         return [self._initial["initial", name, k] for k in range(3)]
 
     def _convert_in_balls(self) -> dict[Place, NumberReading | float]:
-        """Convert in balls.
+        """Convert the document in balls; return the results that no range touches.
 
-        Return what no range touches, floats where exactly 0, +-1.
+        A result that is exactly 0, 1 or -1 is a float, which programs drop as a term or
+        a factor.
         """
         places: list[Place] = []
         varied = [f"p{i}" for i in range(len(self._varied))]
-        names = [*varied, *(f"c{i}" for i in range(len(self._symbols)))]
+        names = [*varied, *(f"c{i}" for i in range(len(self._constants)))]
 
-        def traced(*symbols: Any) -> list[Any]:
-            numbers = dict(zip(self._varied, symbols, strict=False))
-            numbers |= zip(self._symbols, symbols[len(varied) :], strict=True)
-            rows = walk(self._convert(numbers))
-            expressions = [(p, x) for p, x in rows if isinstance(x, Expression)]
-            places[:] = [place for place, _ in expressions]
-            return [x for _, x in expressions]
+        def convert_symbols(*symbols: Any) -> list[Any]:
+            numbers = dict(zip([*self._varied, *self._constants], symbols, strict=True))
+            expressions = []
+            for place, value in walk(self._convert(numbers)):
+                if isinstance(value, Expression):
+                    places.append(place)
+                    expressions.append(value)
+            return expressions
 
-        program = trace(traced, names)
+        program = trace(convert_symbols, names)
+        readings = self._constants.values()
+        convert_read = enclosure.compile_on_balls(program, [x.read for x in readings])
+        convert_written = enclosure.compile_on_balls(
+            program, [x.written for x in readings]
+        )
         ranges = list(self._varied.values())
-        as_read = enclosure.compile_on_balls(
-            program, [x.read for x in self._symbols.values()]
-        )
-        as_written = enclosure.compile_on_balls(
-            program, [x.written for x in self._symbols.values()]
-        )
-        pairs = map(NumberReading, as_read(*ranges), as_written(*ranges))
+        as_read = convert_read(*ranges)
+        as_written = convert_written(*ranges)
         touched = _depend_on_first(program, len(varied))
         settled: dict[Place, NumberReading | float] = {}
-        for place, reading, is_touched in zip(places, pairs, touched, strict=True):
+        for place, read, written, is_touched in zip(
+            places, as_read, as_written, touched, strict=True
+        ):
             if is_touched:
                 continue
+            reading = NumberReading(read, written)
             settled[place] = reading
-            if reading.read in (-1, 0, 1) and not reading.differs:
-                settled[place] = float(reading.read)
+            if read in (-1, 0, 1) and not reading.differs:
+                settled[place] = float(read)
         return settled
 
     def _convert(self, numbers: Mapping[Place, Any]) -> Derived:
@@ -528,46 +519,80 @@ class SceneBalls:
         The compiled function has the inputs, then `self.inputs`; with `by` it returns
         the derivatives by these inputs, too.
         """
-        derived_readings = {
-            p: x for p, x in self._settled.items() if isinstance(x, NumberReading)
-        }
-        folded = {p: x for p, x in self._settled.items() if isinstance(x, float)}
-        symbols = _Constants("c", self._symbols)
+        derived_readings: dict[Place, NumberReading] = {}
+        folded: dict[Place, float] = {}
+        for place, number in self._settled.items():
+            if isinstance(number, NumberReading):
+                derived_readings[place] = number
+            else:
+                folded[place] = number
+        constants = _Constants("c", self._constants)
         derived = _Constants("d", derived_readings)
+        sizes = {
+            "inputs": len(inputs),
+            "varied": len(self.inputs),
+            "constants": len(constants),
+            "derived": len(derived),
+        }
 
-        def traced(*values: Any) -> Any:
-            remaining_symbols = iter(values)
-            function_inputs = list(islice(remaining_symbols, len(inputs)))
-            varied = dict(
-                zip(
-                    self.inputs,
-                    islice(remaining_symbols, len(self.inputs)),
-                    strict=True,
-                )
-            )
+        def traced(*symbols: Any) -> Any:
+            of = divide(sizes, symbols)
+            varied = dict(zip(self.inputs, of["varied"], strict=True))
             reading = varied.pop(READING, 0.0)
-            numbers = symbols.expressions(
-                islice(remaining_symbols, len(symbols)), reading
-            )
+            numbers = constants.expressions(of["constants"], reading)
             numbers |= zip(self._varied, varied.values(), strict=True)
-            derived_numbers = derived.expressions(remaining_symbols, reading)
-            marked = {
-                place: mark_present(x)
-                for place, x in (derived_numbers | folded).items()
-            }
-            derived_scene = rebuild(self._convert(numbers), marked)
-            model = kernel.model_of(derived_scene.scene, derived_scene.axes)
-            present = {
-                p: mark_present(x) for p, x in walk(model) if isinstance(x, Expression)
-            }
-            return function(
-                Parts(rebuild(model, present), derived_scene.axes, derived_scene.scene),
-                *function_inputs,
-            )
+            converted = derived.expressions(of["derived"], reading) | folded
+            marked = {place: mark_present(x) for place, x in converted.items()}
+            scene, axes = rebuild(self._convert(numbers), marked)
+            model = kernel.model_of(scene, axes)
+            present = {}
+            for place, value in walk(model):
+                if isinstance(value, Expression):
+                    present[place] = mark_present(value)
+            return function(Parts(rebuild(model, present), axes, scene), *of["inputs"])
 
-        names = (*inputs, *self.inputs, *symbols.names, *derived.names)
+        names = (*inputs, *self.inputs, *constants.names, *derived.names)
         program = trace(traced, names, by)
-        return enclosure.compile_on_balls(program, [*symbols.balls, *derived.balls])
+        return enclosure.compile_on_balls(program, [*constants.balls, *derived.balls])
+
+
+def _read(
+    scene: Scene, profile: TorqueProfile | None
+) -> tuple[Any, dict[Place, NumberReading]]:
+    """Return the document of a scene, and its numbers by place.
+
+    A sine replaces the torque of the scene.
+    """
+    document, texts = WrittenDocument.of(scene)
+    replaced = isinstance(profile, SineTorque) and profile != scene.torque
+    if replaced:
+        document = rebuild(document, {("torque",): profile})
+    readings: dict[Place, NumberReading] = {}
+    for place, number in leaves(document).items():
+        text = texts.get(place)
+        if replaced and place[0] == "torque":
+            text = None
+        readings[place] = NumberReading.of(number, text)
+    return document, readings
+
+
+def _make_damping(
+    readings: dict[Place, NumberReading], ranges: dict[Place, Any]
+) -> None:
+    """Put the damping of elastic stops in place of restitution and impact rate.
+
+    It is among the ranges if one of these is.
+    """
+    impact = [readings.pop(place) for place in RESTITUTION]
+    if any(place in ranges for place in RESTITUTION):
+        balls = []
+        for place, reading in zip(RESTITUTION, impact, strict=True):
+            balls.append(ranges.pop(place, reading.ball))
+        ranges[DAMPING] = damping_ball(*balls)
+        return
+    as_read = damping_ball(*(reading.read for reading in impact))
+    as_written = damping_ball(*(reading.written for reading in impact))
+    readings[DAMPING] = NumberReading(as_read, as_written)
 
 
 def _depend_on_first(program: Program, count: int) -> list[bool]:

@@ -56,9 +56,11 @@ from sst_ros.progress import Bar
 from sst_ros.proof.balls import (
     arb,
     degrees_up,
+    middles,
     percent_down,
     percent_up,
     precision,
+    rows_of,
     upper,
     write_down,
 )
@@ -68,17 +70,17 @@ from sst_ros.scene.schema import Place, key_of
 from sst_ros.state import Explained
 
 PROVEN, OPEN, REFUTED = 1, 0, -1
+# Limits of a leg, in the order of its products.
+_LEG_LIMITS = (
+    ("gamma", "< 0"),
+    ("gamma", "> arc"),
+    ("beta", "< 0"),
+    ("beta", "> beta_max"),
+)
+LIMITS_OF_LEG = len(_LEG_LIMITS)
+_OF_GAMMA = slice(0, 2)  # of them, those of the stroke
 ZONE_LIMITS = (
-    *(
-        f"{joint}_{leg} {end}"
-        for leg in (1, 2, 3)
-        for joint, end in (
-            ("gamma", "< 0"),
-            ("gamma", "> arc"),
-            ("beta", "< 0"),
-            ("beta", "> beta_max"),
-        )
-    ),
+    *(f"{joint}_{leg} {end}" for leg in (1, 2, 3) for joint, end in _LEG_LIMITS),
     "parallel singularity",
 )
 ZONE_ROUNDING = 1e-13
@@ -104,7 +106,7 @@ SAFE_SHARE = 0.12  # step in gamma [rad] over the square of the least singular v
 LEAST_DET_J2 = 1e-9  # abs(det J2) of a reference pose whose sign is beyond doubt
 MOST_TILT = 3.0  # [rad]: near pi the azimuth moves E the less, and rounding the more
 MOST_ZONE_STEPS = 200  # from one cell to the next
-LIMITS_OF_LEG = 4
+_PRINTED_LIMITS = 3  # those that refute the largest shares
 
 
 class UnitVectors(NamedTuple):
@@ -128,14 +130,14 @@ class TolerantGeometry(NamedTuple):
 
 
 class PoseBalls(NamedTuple):
-    """Balls of poses: all that the turn by an angle leads to."""
+    """Balls of poses: all that a turn by the radius, or less, leads to."""
 
     rotation: Array  # R in the middle, shape (n, 3, 3)
     radius: Array  # angle [rad], shape (n,)
-    #: what is known without looking at the poses, shape (n,): REFUTED, OPEN, and the
-    #: limit
+    # What is known without looking at the poses, shape (n,): REFUTED by a limit, OPEN
+    # where the ball may not hold all poses, else PROVEN.
     status: NDArray[np.int8]
-    limit: NDArray[np.int8]
+    limit: NDArray[np.int8]  # index in ZONE_LIMITS, -1 for none
     in_stroke: NDArray[np.bool_]  # whether all gamma_k are known to be, shape (n,)
 
 
@@ -154,36 +156,40 @@ def enclose_geometry(scene: Scene, ranges: Mapping[Place, Any]) -> TolerantGeome
     Raises InputError where the ranges are so wide that nothing would be proven.
     """
 
-    def vectors(traced_scene: Parts) -> list[Any]:
+    def components(traced_scene: Parts) -> list[Any]:
         axes = traced_scene.axes
         sine, cosine = sin(axes.beta_max), cos(axes.beta_max)
-        reach = []
+        g = []
         for e in axes.e:
-            across = cross3((0.0, 0.0, 1.0), e)
-            reach.append((sine * across[0], sine * across[1], -cosine))
-        rows = (*axes.v, *axes.w, *axes.e, *reach)
-        return [component for row in rows for component in row]
+            x, y, _ = cross3((0.0, 0.0, 1.0), e)
+            g.append((sine * x, sine * y, -cosine))
+        vectors = (*axes.v, *axes.w, *axes.e, *g)
+        return [component for vector in vectors for component in vector]
 
-    size = 36
+    vector_count = len(UnitVectors._fields) * 3
     requirement = f"must move no axis by more than {WIDEST_ZONE} rad"
     named = [key_of(place) for place in ranges]
     with refuse_errors("certify_zone", "ranges", named, requirement, ArithmeticError):
         balls = SceneBalls(scene, None, ranges)
-        run = balls.compile(vectors, (), balls.inputs)
+        run = balls.compile(components, (), balls.inputs)
         varied = balls.varied_balls
-        middle = [arb(x) for x in run(*(ball.mid() for ball in varied))[:size]]
-        slopes = run(*varied)[size:]
-    nominal = [float(x) for x in middle]
-    tolerance, rounding = [], []
-    for row in range(0, size, 3):
-        off = [middle[i] - nominal[i] for i in range(row, row + 3)]
-        nominal_error = _length(off)
+        # The components of all vectors, then their slopes by each input.
+        numbers_in_middle = list(map(arb, run(*middles(varied))))
+        middle_vectors = rows_of(numbers_in_middle, 3)[:vector_count]
+        _, *slopes_by_input = rows_of(run(*varied), 3 * vector_count)
+    slopes = [rows_of(numbers, 3) for numbers in slopes_by_input]  # by input and vector
+    nominal = []
+    tolerance = []
+    rounding = []
+    for number, middle in enumerate(middle_vectors):
+        vector = [float(x) for x in middle]
+        nominal.append(vector)
+        error = _length([x - y for x, y in zip(middle, vector, strict=True)])
         moved = arb(0)
-        for j, ball in enumerate(varied):
-            first = size * j + row
-            moved += _length(slopes[first : first + 3]) * ball.rad()
-        rounding.append(ARC_OF_CHORD * upper(nominal_error) + ZONE_ROUNDING)
-        tolerance.append(ARC_OF_CHORD * upper(nominal_error + moved) + ZONE_ROUNDING)
+        for slopes_of_vectors, ball in zip(slopes, varied, strict=True):
+            moved += _length(slopes_of_vectors[number]) * ball.rad()
+        rounding.append(ARC_OF_CHORD * upper(error) + ZONE_ROUNDING)
+        tolerance.append(ARC_OF_CHORD * upper(error + moved) + ZONE_ROUNDING)
     widest = max(tolerance)
     fits = math.isfinite(widest) and widest <= WIDEST_ZONE
     refuse_unless("certify_zone", ("ranges", named, fits, requirement))
@@ -205,12 +211,12 @@ def _length(vector: Sequence[Any]) -> Any:
 def decide(geometry: TolerantGeometry, poses: PoseBalls, side: float) -> Verdicts:
     """Decide for each ball of poses whether it is inside all limits, or beyond one.
 
-    `side` is the sign of D that is asked for.
+    `side` is the sign that D must have.
     """
     products = limit_products(geometry.vectors, poses.rotation)
     angle = poses.radius[:, None, None]
     inside = products > _sine(angle + _spread(geometry.tolerance)) + ZONE_ROUNDING
-    inside[..., :2] |= poses.in_stroke[:, None, None]
+    inside[..., _OF_GAMMA] |= poses.in_stroke[:, None, None]
     beyond = products < -_sine(angle + _spread(geometry.rounding)) - ZONE_ROUNDING
 
     determinant, slope = determinant_and_slope(geometry.vectors, poses.rotation)
@@ -234,11 +240,13 @@ def decide(geometry: TolerantGeometry, poses: PoseBalls, side: float) -> Verdict
 def limit_products(vectors: UnitVectors, rotation: Array) -> Array:
     """Products of unit vectors that are positive inside the limits, (n, leg, limit)."""
     v, w, e, g = vectors
-    turned = np.swapaxes(rotation, -1, -2)
-    t, reach = e @ turned, g @ turned
-    s = rotation[:, None, :, 2]
-    following = np.roll(v, -1, axis=0)
-    return np.stack([-dot(v, t), dot(following, t), dot(w, s), dot(w, reach)], axis=-1)
+    transposed = np.swapaxes(rotation, -1, -2)
+    t = e @ transposed
+    turned_g = g @ transposed
+    _x, _y, z = np.moveaxis(rotation, -1, 0)
+    s = z[:, None]
+    next_v = np.roll(v, -1, axis=0)
+    return np.stack([-dot(v, t), dot(next_v, t), dot(w, s), dot(w, turned_g)], axis=-1)
 
 
 def determinant_and_slope(vectors: UnitVectors, rotation: Array) -> tuple[Array, Array]:
@@ -352,7 +360,7 @@ class OrientationCap:
     def coordinates(self, rotation: ArrayLike) -> Array:
         """Coordinates of rotations (..., 3, 3), shape (..., 3).
 
-        Beyond 0 to 1 outside.
+        In the cap they are from 0 to 1.
         """
         relative = self.reference.T @ np.asarray(rotation, dtype=float)
         azimuth, tilt, psi = np.moveaxis(zyz_angles(relative), -1, 0)
@@ -413,8 +421,9 @@ class OrientationCap:
     def _reach(self, cells: Cells) -> Array:
         """Return how far cells turn the star in each coordinate [rad], shape (n, 3)."""
         low, high = self._tilts(cells)
-        around = 2.0 * np.sin(0.5 * high) * np.pi * cells.size[:, 0]
-        about = self.torsion * cells.size[:, 2]
+        azimuth_size, _, torsion_size = cells.size.T
+        around = 2.0 * np.sin(0.5 * high) * np.pi * azimuth_size
+        about = self.torsion * torsion_size
         return np.stack([around, 0.5 * (high - low), about], axis=1)
 
 
@@ -426,9 +435,9 @@ def _undivided_cell(known_at: Array, known_rotation: Array) -> Cells:
 
 
 def tilted(azimuth: Array, tilt: Array, torsion: Array) -> Array:
-    """Return matrices Rz(azimuth) Ry(tilt) Rz(torsion - azimuth).
+    """Return Rz(azimuth) Ry(tilt) Rz(torsion - azimuth), shape (n, 3, 3).
 
-    They have the shape (n, 3, 3), the angles (n,).
+    The angles [rad] have the shape (n,).
     """
     psi = torsion - azimuth
     ca, sa = np.cos(azimuth), np.sin(azimuth)
@@ -466,10 +475,10 @@ class GammaBox:
         # r_k = cos(gamma_k) v_k + sin(gamma_k) w_k x v_k
         self._moved = math.sqrt(2.0) * v + w + e
         self._arc = _arcs(tolerant.vectors.v)
-        rows = zip(tolerant.tolerance.v, tolerant.rounding.v, strict=True)
-        wide, exact = np.array(list(rows)).T
-        self._shortest = self._arc - wide - np.roll(wide, -1) - ZONE_ROUNDING
-        self._longest = self._arc + exact + np.roll(exact, -1) + ZONE_ROUNDING
+        # Least arc of all geometries, and largest arc of that in the middle.
+        rounding = tolerant.rounding.v
+        self._shortest = self._arc - v - np.roll(v, -1) - ZONE_ROUNDING
+        self._longest = self._arc + rounding + np.roll(rounding, -1) + ZONE_ROUNDING
 
     def coordinates(self, gamma: ArrayLike) -> Array:
         """Coordinates of actuator angles [rad], both of shape (..., 3)."""
@@ -491,7 +500,7 @@ class GammaBox:
     def poses(self, cells: Cells) -> PoseBalls:
         """Return balls that hold the assembly for all angles of cells.
 
-        They do so where the assembly is followed.
+        Where the assembly is not followed the status is OPEN.
         """
         rotation, followed = self._follow(cells)
         half = 0.5 * cells.size * (self.high - self.low)
@@ -516,12 +525,12 @@ class GammaBox:
         )
 
     def _follow(self, cells: Cells) -> tuple[Array, NDArray[np.bool_]]:
-        """Follow the known assemblies to the middles of cells.
+        """Follow the known assemblies straight to the middles of cells.
 
-        Return where that succeeded.
+        Return the rotations there, and which of them were reached.
         """
-        begin, end = self.angles(cells.known_at), self.angles(cells.middle)
-        segment = end - begin
+        begin = self.angles(cells.known_at)
+        segment = self.angles(cells.middle) - begin
         length = np.linalg.norm(segment, axis=1)
         rotation = cells.known_rotation.copy()
         followed_share = np.zeros(len(segment))
@@ -532,18 +541,19 @@ class GammaBox:
             gamma = begin[active] + followed_share[active, None] * segment[active]
             sigma = _least_singular(self._j2(gamma, rotation[active]))
             regular = sigma > LEAST_ZONE_SIGMA
-            active, sigma = active[regular], sigma[regular]
+            active = active[regular]
+            sigma = sigma[regular]
             step = SAFE_SHARE * sigma**2
             share = np.minimum(followed_share[active] + step / length[active], 1.0)
             target = begin[active] + share[:, None] * segment[active]
             moved, closes = self._newton(target, rotation[active])
-            change = np.abs(share - followed_share[active])[:, None] * np.abs(
-                segment[active]
-            )
+            share_change = np.abs(share - followed_share[active])
+            change = share_change[:, None] * np.abs(segment[active])
             reach = _reach_of_assembly(change + ZONE_ROUNDING, sigma)
             safe = closes & (_angle(rotation[active], moved) < reach)
             active = active[safe]
-            rotation[active], followed_share[active] = moved[safe], share[safe]
+            rotation[active] = moved[safe]
+            followed_share[active] = share[safe]
             active = active[share[safe] < 1.0]
         return rotation, (length == 0.0) | (followed_share == 1.0)
 
@@ -569,18 +579,15 @@ class GammaBox:
 
 def _arcs(v: Array) -> Array:
     """Angles between unit vectors v_k and v_k+1 [rad], shape (3,)."""
-    following = np.roll(v, -1, axis=0)
-    sine = np.linalg.norm(cross(v, following), axis=1)
-    return np.asarray(np.arctan2(sine, dot(v, following)), dtype=float)
+    next_v = np.roll(v, -1, axis=0)
+    sine = np.linalg.norm(cross(v, next_v), axis=1)
+    return np.asarray(np.arctan2(sine, dot(v, next_v)), dtype=float)
 
 
 def _least_singular(matrices: Array) -> Array:
-    """Return bounds below the least singular values of matrices.
-
-    The matrices have the shape (n, 3, 3), the bounds (n,).
-    """
+    """Bound the least singular values of matrices (n, 3, 3) from below, shape (n,)."""
     sigma = np.asarray(np.linalg.svd(matrices, compute_uv=False), dtype=float)
-    return np.asarray(sigma[:, 2] - ZONE_ROUNDING, dtype=float)
+    return np.asarray(sigma[:, -1] - ZONE_ROUNDING, dtype=float)
 
 
 def _reach_of_assembly(moved: Array, sigma: Array) -> Array:
@@ -637,15 +644,17 @@ def subdivide(
         is_open = verdicts.status == OPEN
         leaves.append(block.rows(~is_open))
         decided.append(Verdicts(*(array[~is_open] for array in verdicts)))
-        larger = block.rows(is_open)
-        cells = join_cells([later_cells, larger.halve(zone.longest(larger))])
+        undecided_cells = block.rows(is_open)
+        halves = undecided_cells.halve(zone.longest(undecided_cells))
+        cells = join_cells([later_cells, halves])
         bar.draw(examined / max_boxes)
     bar.draw(1.0)
+    # What is left when the budget is used up.
     leaves.append(cells)
     count = len(cells.low)
-    undecided = np.full(count, OPEN, dtype=np.int8)
+    left_open = np.full(count, OPEN, dtype=np.int8)
     no_limit = np.full(count, -1, dtype=np.int8)
-    decided.append(Verdicts(undecided, no_limit, np.zeros(count), np.zeros(count)))
+    decided.append(Verdicts(left_open, no_limit, np.zeros(count), np.zeros(count)))
     verdicts = Verdicts(*(np.concatenate(rows) for rows in zip(*decided, strict=True)))
     return Subdivision(join_cells(leaves), verdicts, examined)
 
@@ -697,7 +706,8 @@ class ProvenZone(Explained):
         self.examined = parts.examined
         self.names = zone.NAMES
         self._zone = zone
-        self._cells = cells = parts.cells
+        cells = parts.cells
+        self._cells = cells
         verdicts = parts.verdicts
         low, high = zone.angles(cells.low), zone.angles(cells.low + cells.size)
         self.columns: dict[str, NDArray[Any]] = {}
@@ -724,7 +734,8 @@ class ProvenZone(Explained):
         self.least_det_j2 = float(np.min(verdicts.det_j2[is_proven], initial=np.inf))
         self.least_sine_mu = float(np.min(verdicts.sine_mu[is_proven], initial=np.inf))
         if not self.proven:
-            self.least_det_j2 = self.least_sine_mu = math.nan
+            self.least_det_j2 = math.nan
+            self.least_sine_mu = math.nan
         self.nearest = self._find_nearest(
             cells.rows(is_refuted), verdicts.limit[is_refuted]
         )
@@ -780,28 +791,30 @@ class ProvenZone(Explained):
     def turns_at(self, directions: ArrayLike) -> Array:
         """Torsion [rad] that is refuted, open and proven at directions of E in {B}.
 
-        Shapes (m, 3) of both; all zero outside of the cap. A box of actuator angles has
-        no torsion: InputError.
+        Both have the shape (m, 3); the torsions are zero outside of the cap. Raises
+        InputError for a box of actuator angles, which has no torsion.
         """
         zone = self._zone
         is_cap = isinstance(zone, OrientationCap)
         refuse_unless("turns_at", ("zone", self.names, is_cap, "must be a cap"))
         assert isinstance(zone, OrientationCap)
         places = zone.coordinates(orientations(np.asarray(directions), 0.0))
-        low, high = self._cells.low, self._cells.low + self._cells.size
-        widths = 2.0 * zone.torsion * self._cells.size[:, 2]
+        low = self._cells.low
+        high = low + self._cells.size
+        _, _, torsion_size = self._cells.size.T
+        widths = 2.0 * zone.torsion * torsion_size
+        of_direction = slice(0, 2)  # azimuth and tilt
         turns = np.zeros((len(places), 3))
-        for row, place in enumerate(places[:, :2]):
-            inside = np.all((low[:, :2] <= place) & (place < high[:, :2]), axis=1)
-            status = self.columns["status"][inside] - REFUTED
-            turns[row] = np.bincount(status, widths[inside], minlength=3)
+        for row, place in enumerate(places):
+            above = low[:, of_direction] <= place[of_direction]
+            below = place[of_direction] < high[:, of_direction]
+            inside = np.all(above & below, axis=1)
+            column = self.columns["status"][inside] - REFUTED  # from 0 on
+            turns[row] = np.bincount(column, widths[inside], minlength=3)
         return turns
 
     def middles(self) -> Array:
-        """R in the middle of each box, shape (n, 3, 3).
-
-        Nan where no assembly is known.
-        """
+        """R in the middle of each box, shape (n, 3, 3); nan where none is known."""
         poses = self._zone.poses(self._cells)
         is_known = poses.status != OPEN
         return np.asarray(np.where(is_known[:, None, None], poses.rotation, np.nan))
@@ -811,16 +824,22 @@ class ProvenZone(Explained):
         return require("pandas").DataFrame(self.columns)
 
     def _facts(self) -> dict[str, object]:
-        about = ", ".join(
-            f"{name} {low!r} to {high!r} rad"
-            for name, (low, high) in self._extent().items()
-        )
-        facts: dict[str, object] = {"scene": self.scene.name, "zone": about}
-        facts["shares"] = self.shares
+        low, high = self._zone.angles(np.array([[0.0] * 3, [1.0] * 3])).tolist()
+        extent = zip(self.names, low, high, strict=True)
+        facts: dict[str, object] = {
+            "scene": self.scene.name,
+            "zone": ", ".join(
+                f"{name} {least!r} to {most!r} rad" for name, least, most in extent
+            ),
+            "shares": self.shares,
+        }
         shares = {name: share for name, share in self.refuted_by.items() if share}
         if shares:
-            largest = sorted(shares, key=shares.__getitem__, reverse=True)[:3]
-            limit_shares = [f"{percent_down(shares[x], 3)} {x}" for x in largest]
+            largest = sorted(shares, key=shares.__getitem__, reverse=True)
+            limit_shares = [
+                f"{percent_down(shares[name], 3)} {name}"
+                for name in largest[:_PRINTED_LIMITS]
+            ]
             facts["refuted by"] = ", ".join(limit_shares)
         if self.proven:
             facts["abs(det J2)"] = f"above {write_down(self.least_det_j2, 3)}"
@@ -829,13 +848,6 @@ class ProvenZone(Explained):
             away = degrees_up(self.nearest.distance, 4)
             facts["beyond"] = f"{self.nearest.limit}, {away} from the reference pose"
         return facts | {"boxes": self.examined}
-
-    def _extent(self) -> dict[str, tuple[float, float]]:
-        """Range of each coordinate [rad]."""
-        low, high = self._zone.angles(np.array([[0.0] * 3, [1.0] * 3]))
-        return dict(
-            zip(self.names, zip(low.tolist(), high.tolist(), strict=True), strict=True)
-        )
 
 
 @check_kinds
@@ -972,12 +984,10 @@ def _check_arguments(
 
 def _refuse_other_ranges(balls: Mapping[Place, Any]) -> None:
     """Refuse ranges of numbers that the geometry does not depend on."""
+    geometry = ", ".join(map(key_of, GEOMETRY_KEYS))
+    requirement = f"is no part of the geometry, which is {geometry}"
     for place in balls:
         is_geometry = any(place[: len(key)] == key for key in GEOMETRY_KEYS)
-        requirement = (
-            "is no part of the geometry, which is "
-            f"{', '.join(map(key_of, GEOMETRY_KEYS))}"
-        )
         refuse_unless(
             "certify_zone", ("ranges", key_of(place), is_geometry, requirement)
         )

@@ -277,7 +277,9 @@ class Bag:
         try:
             # Not written to, nor is a journal made beside it.
             address = f"{path.absolute().as_uri()}?immutable=1"
-            if unfinished:  # SQLite brings a copy to its last whole state
+            if not unfinished:
+                _check_pages(path)
+            else:  # SQLite brings a copy to its last whole state
                 own = folder / "unfinished"
                 own.mkdir(exist_ok=True)
                 for file in (path, *unfinished):
@@ -619,6 +621,37 @@ def _prepare(path: Path, folder: Path) -> tuple[Path, str]:
     named = _split_name(path)
     is_database = begin == _SQLITE_MAGIC or (named and named["storage"] == "db3")
     return path, "db3" if is_database else "mcap"
+
+
+_SQLITE_HEADER_BYTES = 100
+_LARGEST_PAGE = 65536  # which the header writes as 1
+
+
+def _check_pages(path: Path) -> None:
+    """Check that a database has as many pages as its header says.
+
+    SQLite 3.53 does not do so where it opens a file as immutable. A header without a
+    valid number of pages is not checked (SQLite's file format, 1.3).
+
+    Raises:
+        ValueError: the file is shorter.
+
+    """
+    with path.open("rb") as file:
+        header = file.read(_SQLITE_HEADER_BYTES)
+    page_bytes = int.from_bytes(header[16:18], "big")
+    if page_bytes == 1:
+        page_bytes = _LARGEST_PAGE
+    pages = int.from_bytes(header[28:32], "big")
+    changes = header[24:28]
+    changes_when_counted = header[92:96]
+    is_counted = header.startswith(b"SQLite format 3\0") and (
+        changes == changes_when_counted
+    )
+    expected_bytes = pages * page_bytes
+    file_bytes = path.stat().st_size
+    if is_counted and file_bytes < expected_bytes:
+        raise ValueError(f"the file has {file_bytes} of {expected_bytes} bytes")
 
 
 def _magic(path: Path) -> bytes:

@@ -19,6 +19,8 @@ from sst_ros.state import BASE_FRAME, NANOSECONDS, ZERO, Vector3
 REACTION_JOINTS = tuple(f"{joint}_{leg}" for joint in LINK_JOINTS for leg in (1, 2, 3))
 """Joints that ~/reaction can be of."""
 _OF_A_GOAL = ", where the goal does not give it; 0 for none"
+_TICK_ROUNDING = 1e-6
+"""Share of a tick by which a number of ticks may be off: more than rounding."""
 
 _number = partial(entry, least=0.0, most=1e6)
 _positive = partial(entry, above=0.0, most=1.0)
@@ -224,12 +226,21 @@ class SimulatorParameters(NodeParameters):
             yield 0.0 < value < 1e-3, name, value, "must be 0 or >= 0.001"
 
     @property
+    def _last_tick(self) -> int:
+        """Number of the tick that ends the run, without an end the largest number.
+
+        A duration may be a whole number of ticks but for its rounding.
+        """
+        ticks = self.duration * self.rate
+        return math.ceil(ticks - _TICK_ROUNDING) or sys.maxsize
+
+    @property
     def run(self) -> RunSettings:
         """Return what the run takes from them."""
         return RunSettings(
             period_ns=NANOSECONDS // self.rate,
             ticks_per_sample=self.rate // self.publish_rate,
-            last_tick=math.ceil(self.duration * self.rate - 1e-6) or sys.maxsize,
+            last_tick=self._last_tick,
             lockstep=self.sync == "lockstep",
             own_clock=self.publish_clock,
             waits=self.wait_for_command or self.sync == "lockstep",

@@ -87,6 +87,9 @@ class TorqueInput:
         self._commands = commands
         self._stamped = stamped
         self._moments = moments
+        self._arrivals = [commands, stamped]
+        if moments is not None:
+            self._arrivals.append(moments)
         self.received = 0
         self.dropped = 0
         self.clamped = 0
@@ -96,7 +99,7 @@ class TorqueInput:
 
     def clear(self) -> None:
         """Forget the command and all arrivals: zero torque until the next command."""
-        for arrivals in filter(None, (self._commands, self._stamped, self._moments)):
+        for arrivals in self._arrivals:
             arrivals.read(math.inf)
         self._forget()
 
@@ -127,12 +130,7 @@ class TorqueInput:
         """
         if self.stale and self._damping > 0.0:  # the torque depends on the state
             return False
-        moments = self._moments
-        if (
-            self._commands.waiting
-            or self._stamped.waiting
-            or (moments and moments.waiting)
-        ):
+        if any(arrivals.waiting for arrivals in self._arrivals):
             return False
         if self.begun and not self.stale and self._is_old(self._since, until_ns):
             return False

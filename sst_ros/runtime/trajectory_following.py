@@ -16,11 +16,10 @@ import numpy as np
 from sst_ros.control.actuator_space import Reference, ReferenceMotion, slow_down
 from sst_ros.control.controller import (
     Controller,
-    Measurement,
     TrackingMetrics,
     track_of,
 )
-from sst_ros.control.law import Command, command_limit
+from sst_ros.control.law import Command, Measurement, command_limit
 from sst_ros.control.plan import check_motion
 from sst_ros.control.reference_motions import reference_motion
 from sst_ros.errors import SstError, refusal, refuse_unless

@@ -11,7 +11,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,13 +77,13 @@ def load_table(
     """
     try:
         check_regular(path)
+        # Opened here: NumPy leaves a damaged file open that it has opened itself.
         with path.open("rb") as file:
             zipped = file.read(2) == b"PK"
-        if zipped:
-            with np.load(path, allow_pickle=False) as source:
-                numbers = {name: source[name] for name in columns}
-                stored_texts = {name: str(source[name]) for name in (*texts, _CHECKSUM)}
-        else:
+            if zipped:
+                file.seek(0)
+                numbers, stored_texts = _read_npz(file, columns, texts)
+        if not zipped:
             parquet = require("pyarrow.parquet")
             with parquet.ParquetFile(path, page_checksum_verification=True) as source:
                 table = source.read()
@@ -99,6 +99,16 @@ def load_table(
     if stored_texts.get(_CHECKSUM, checksum) != checksum:
         raise ValueError("its checksum is another")
     return numbers, requested_texts
+
+
+def _read_npz(
+    file: BinaryIO, columns: Sequence[str], texts: Sequence[str]
+) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Read columns and texts, with the checksum, of an NPZ file."""
+    with np.load(file, allow_pickle=False) as source:
+        numbers = {name: source[name] for name in columns}
+        stored_texts = {name: str(source[name]) for name in (*texts, _CHECKSUM)}
+    return numbers, stored_texts
 
 
 def compute_checksum(

@@ -264,12 +264,12 @@ class ControlledBatch:
         gains = divide(GAINS, numbers["gains"])
         memory = divide(self._memory_sizes, numbers["memory"])
         noise = self._scale_noise(numbers["uniform"], gains["noise"])
-        gamma, gamma_dot, encoder_angles = control.measure(
+        measured, encoder_angles = control.measure(
             joints.gamma, joints.gamma_dot, memory["before"], noise
         )
         observed = memory["observed"]
         if observed:  # in the last assembly mode
-            carriages = space.carriages(gamma)
+            carriages = space.carriages(measured.gamma)
             for _ in range(CONTROL_NEWTON_STEPS):
                 x, y, z, w, *_ = space.newton_step(*observed, *carriages)
                 observed = (x, y, z, w)
@@ -286,9 +286,7 @@ class ControlledBatch:
             control.period,
         )
         ahead = reference["feedforward"], reference["held"]
-        answer = scheme.answer(
-            desired, ahead, gamma, gamma_dot, observed, memory["integral"]
-        )
+        answer = scheme.answer(desired, ahead, measured, observed, memory["integral"])
         sent, queue = control.transmit(
             answer.torque, memory["queue"], reference["first"][0]
         )

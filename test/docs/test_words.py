@@ -7,7 +7,8 @@ import pytest
 from docs.blocks import ROOT
 
 PATTERN = re.compile(
-    r"\b(told|(?<!\.)tells?|judged?|judges|journey|promptest|sooner|ways?|nobody|anybody|whoever|watched|"
+    r"\b(told|(?<!\.)tells?|judged?|judges|journey|promptest|sooner|ways?|"
+    r"nobody|anybody|whoever|watched|"
     r"so far|in no time|to and fr[o]|hangs? on|gets? there|lets? go of|laid out|lays?"
     r" out|for ever|"
     r"the house|what (?:has come|they have wrong|became|came))\b|"

@@ -87,6 +87,8 @@ class ForkedNode:
         except TimeoutError as error:
             raise subprocess.TimeoutExpired("node", timeout) from error
         self.wait(timeout)
+        for pipe in (self.stdout, self.stderr):
+            pipe.close()
         return texts
 
     def send_signal(self, number):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 
 from sst_ros.nodes import topics
@@ -171,7 +172,7 @@ def test_foxglove_plots_and_shows_what_is_published():
     layout = json.loads((CONFIG / "foxglove.json").read_text(encoding="utf-8"))
     panels = layout["configById"]
     paths = [entry["value"] for paths in values(panels, "paths") for entry in paths]
-    assert len(paths) == 12
+    assert len(paths) == 21
     for path in paths:
         topic, _, field = path.partition(".")
         assert field_type(PUBLISHED[topic], field) == "double", path
@@ -215,9 +216,12 @@ def test_rviz_shows_our_topic_and_frame():
     displays = {
         display["Class"].split("/")[1]: display for display in manager["Displays"]
     }
-    assert set(displays) == {"Grid", "RobotModel", "TF"}
+    assert set(displays) == {"Grid", "RobotModel", "TF", "Wrench"}
     description = displays["RobotModel"]["Description Topic"]
     assert description["Value"] == topics.SIMULATOR["robot_description"].name
     assert description["Durability Policy"] == "Transient Local"
+    reaction = displays["Wrench"]["Topic"]
+    assert f"/{reaction['Value']}" == topics.SIMULATOR["reaction"].at("/sst_simulator")
+    assert PUBLISHED[f"/{reaction['Value']}"] is WrenchStamped
     assert manager["Global Options"]["Fixed Frame"] == BASE_FRAME
     assert displays["Grid"]["Reference Frame"] == BASE_FRAME
