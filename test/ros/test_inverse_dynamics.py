@@ -261,6 +261,7 @@ def test_gains_are_set_while_it_runs_or_refused_with_the_reason(
     assert np.abs(np.subtract(reference[-1].position[1:], HOME[1:])).max() < 1e-12
 
 
+@pytest.mark.breadth
 def test_a_stream_of_trajectories_moves_a_run_without_a_jump(nodes, observer, tmp_path):
     """Ten points a second, each a second ahead.
 
