@@ -331,9 +331,9 @@ def _quartic(a: Array, b: Array, c: Array) -> Array:
     The form is that of cos(y)^2 + sin(y)^2 - 1, where (cos y, sin y, 1) is the cross
     product of the rows (a, b, c) of legs 2 and 3.
     """
-    a_2, a_3 = np.moveaxis(a, 1, 0)
+    a_2, a_3 = a.swapaxes(0, 1)
     b_2, b_3 = b.T[:, :, None]
-    c_2, c_3 = np.moveaxis(c, 1, 0)
+    c_2, c_3 = c.swapaxes(0, 1)
     cosine = b_2 * c_3 - b_3 * c_2
     scale = a_2 * b_3 - a_3 * b_2
     sine = _product(c_2, a_3) - _product(a_2, c_3)
@@ -457,7 +457,7 @@ def _polish(r: Array, e: Array, rotation: Array) -> tuple[Array, Array]:
 
 def _newton_step(slope: Array, residual: Array) -> Array:
     """Solve slope step = -residual, by the shortest step where nearly singular."""
-    first, second, third = np.moveaxis(slope, 1, 0)
+    first, second, third = slope.swapaxes(0, 1)
     # A^-1 is the adjugate over the determinant; its columns are these vector products.
     adjugate = columns(cross(second, third), cross(third, first), cross(first, second))
     determinant = dot(first, adjugate[:, :, 0])

@@ -345,16 +345,13 @@ class BallEquations:
         Both are functions of time and state between two kinks.
         """
         value, jacobian = self.derivatives
-        return self._commanded(value, begin, end), self._commanded(jacobian, begin, end)
+        return self.command(value, begin, end), self.command(jacobian, begin, end)
 
-    def limits_between(self, begin: float, end: float) -> Function:
-        """Return the function of time and state whose signs `limit_names` names."""
-        return self._commanded(self._limits, begin, end)
+    def command(self, function: Function, begin: float, end: float) -> Function:
+        """Return a function of time and state between two kinks.
 
-    def _commanded(self, function: Function, begin: float, end: float) -> Function:
-        """Return a function of time and state, from one that has commands, too.
-
-        The commands are those of the profile; a controller has its own in the state.
+        The given one has commands, too. They are those of the profile; a controller has
+        its own in the state.
         """
         if self.loop is not None:
             return function
@@ -437,13 +434,12 @@ class BallEquations:
                 dry_joints.append(joint_kind)
         return dry_joints
 
-    def turns_between(self, begin: float, end: float) -> Function:
-        """Return the function of time and state whose signs `turn_names` names."""
-        return self._commanded(self._dry_joint_rates, begin, end)
-
     @cached_property
-    def _dry_joint_rates(self) -> Function:
-        """Compile the rates of the joints with dry friction [rad/s]."""
+    def turn_rates(self) -> Function:
+        """Compile the rates of the joints [rad/s] that `turn_names` names.
+
+        They are functions of time, state, commands and the numbers that are ranges.
+        """
 
         def rates(
             traced_scene: Parts, time: Any, *state_and_commands: Any
@@ -458,7 +454,7 @@ class BallEquations:
         return self.balls.compile(rates, self._function_inputs)
 
     @cached_property
-    def _limits(self) -> Function:
+    def limits(self) -> Function:
         """Compile numbers that are zero at a limit and positive inside.
 
         They are functions of time, state, commands and the numbers that are ranges, in
@@ -596,17 +592,19 @@ class Follower:
         max_steps: int,
         bar: Bar,
     ) -> None:
-        loop = self._equations.loop
-        region = self._equations.start()
+        equations = self._equations
+        loop = equations.loop
+        region = equations.start()
         for begin, end in pairwise(breaks):
             if loop is not None:
                 region = self._sample(loop, region)
-            f, jacobian = self._equations.between(begin, end)
-            limits = self._equations.limits_between(begin, end)
+            f, jacobian = equations.between(begin, end)
+            limits = equations.command(equations.limits, begin, end)
             for step in ProvenSteps(f, jacobian, region, end, tolerance, order):
                 self._take(step, limits)
-                if self._equations.turn_names:
-                    self._note_turns(step, begin, end)
+                if equations.turn_names:
+                    rates = equations.command(equations.turn_rates, begin, end)
+                    self._note_signs(step, equations.turn_names, rates, TURN_SPLITS)
                 bar.draw(step.end / breaks[-1])
                 if self.reason:
                     return
@@ -625,29 +623,28 @@ class Follower:
     def _take(self, step: Advance, limits: Function) -> None:
         """Take what a step proves, up to where the motion meets an end of the scene."""
         self.steps += 1
-        end = step.end
         names = self._equations.limit_names
+        self.until = self._note_signs(step, names, limits, SPLITS)
+        while self._times_left and self._times_left[0] <= self.until:
+            self.rows.append(self._row(step, self._times_left.pop(0)))
+
+    def _note_signs(
+        self, step: Advance, names: Sequence[str], function: Function, splits: int
+    ) -> float:
+        """Note the signs of numbers in a step, and where the motion ends by them.
+
+        Return the end of the step [s], or the time at which a limit that stops the
+        motion may be met.
+        """
+        end = step.end
         stop_names = self._equations.stop_names
-        for low, high, signs in _signs(step, limits, len(names), SPLITS):
+        for low, high, signs in _signs(step, function, len(names), splits):
             for name, sign in zip(names, signs, strict=True):
                 self.signs[name].append(SignSpan(low, high, sign))
                 if name in stop_names and sign <= 0 and low < end:
                     self.reason = name
                     end = low
-        self.until = end
-        while self._times_left and self._times_left[0] <= end:
-            self.rows.append(self._row(step, self._times_left.pop(0)))
-
-    def _note_turns(self, step: Advance, begin: float, end: float) -> None:
-        """Note when joints with dry friction may turn back in a step.
-
-        Begin and end are the kinks in time between which it lies.
-        """
-        names = self._equations.turn_names
-        rates = self._equations.turns_between(begin, end)
-        for low, high, signs in _signs(step, rates, len(names), TURN_SPLITS):
-            for name, sign in zip(names, signs, strict=True):
-                self.signs[name].append(SignSpan(low, high, sign))
+        return end
 
     def _row(self, step: Advance, time: float) -> Row:
         """Return what a step proves at an instant."""

@@ -17,11 +17,14 @@ import numpy as np
 from sst_ros.scene.schema import Rules, Section, amount, angles, coefficient, entry
 from sst_ros.state import ZERO, Quaternion, Vector3
 
-JOINTS = tuple(
-    f"{angle}_{leg}" for angle in ("gamma", "mu", "beta") for leg in (1, 2, 3)
-)
-ACTUATED_JOINTS = JOINTS[:3]
-PASSIVE_JOINTS = JOINTS[3:]
+
+def _name_joints(angle: str) -> tuple[str, ...]:
+    return tuple(f"{angle}_{leg}" for leg in (1, 2, 3))
+
+
+ACTUATED_JOINTS = _name_joints("gamma")
+PASSIVE_JOINTS = (*_name_joints("mu"), *_name_joints("beta"))
+JOINTS = (*ACTUATED_JOINTS, *PASSIVE_JOINTS)
 MOMENTS = ("moment_x", "moment_y", "moment_z")  # beside the torques of a tick
 NANOSECOND = 1e-9  # resolution of time [s]
 _duration = partial(entry, "time that it takes", "s", least=NANOSECOND)
