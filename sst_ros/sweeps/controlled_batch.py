@@ -479,17 +479,20 @@ class ControlledBatch:
 
         inertia = np.array(self._controller.inertia)[:, None]
         varies = {"control.stiffness", "control.damping"} & varied.keys()
-        rows = (
-            *law.feedback_gains(inertia, value, self._control.direct or bool(varies)),
-            inertia,
-            value("integral_rate"),
-            law.command_limit(value("torque_limit"), self._scene),
-            batch.columns.torque_limit,
-            value("angle_noise"),
-            value("rate_noise"),
-        )
+        direct = self._control.direct or bool(varies)
+        stiffness, damping = law.feedback_gains(inertia, value, direct)
+        noise = np.broadcast_arrays(value("angle_noise"), value("rate_noise"))
+        gains = {
+            "kp": stiffness,
+            "kd": damping,
+            "inertia": inertia,
+            "rate": value("integral_rate"),
+            "limit": law.command_limit(value("torque_limit"), self._scene),
+            "plant_limit": batch.columns.torque_limit,
+            "noise": noise,
+        }
         columns = []
-        for row in rows:
-            components = np.atleast_2d(row)
-            columns.append(np.broadcast_to(components, (len(components), count)))
+        for name, size in GAINS.items():
+            rows = np.reshape(gains[name], (size, -1))
+            columns.append(np.broadcast_to(rows, (size, count)))
         return np.concatenate(columns)
