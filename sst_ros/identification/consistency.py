@@ -271,6 +271,7 @@ class _BarrierProblem(NamedTuple):
         return values
 
     def _matrices(self, values: Array) -> Array:
+        """Return the matrices that must be positive definite, shape (k, 4, 4)."""
         return np.asarray(self.constant + np.tensordot(values, self.basis, 1))
 
     def _cost(self, values: Array, barrier: float) -> float:

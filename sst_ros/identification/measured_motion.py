@@ -272,6 +272,7 @@ def _take_measured(run: Recording) -> tuple[dict[str, Any], Known]:
     begins = ticks.start_ns / NANOSECONDS
     ends = ticks.end_ns / NANOSECONDS
     all_times = signals["t"]
+    # while torques are known, to the rounding of seconds
     rows = (all_times >= begins[0] - 1e-12) & (all_times <= ends[-1] + 1e-12)
     samples: dict[str, Any] = {name: array[rows] for name, array in signals.items()}
     t = samples["t"]

@@ -67,6 +67,14 @@ class EnergySums(NamedTuple):
     samples: int
 
 
+class _Curves(NamedTuple):
+    """Angles of the actuators and two derivatives: functions of the time [s]."""
+
+    angle: Any
+    rate: Any
+    acceleration: Any
+
+
 class MeasuredPath:
     """Angles, rates and accelerations along one segment, and where it is evaluated.
 
@@ -83,7 +91,7 @@ class MeasuredPath:
         self,
         measured: MeasuredMotion,
         space: ActuatorSpaceMap,
-        curves: Any,
+        curves: _Curves,
         unsettled: int,
         band: float | None,
     ) -> None:
@@ -128,16 +136,16 @@ class MeasuredPath:
             band = min(BAND * bandwidth, cutoff or np.inf)
             smooth, unsettled = filter_angles(t, measured.gamma, cutoff)
             angle = make_interp_spline(t, smooth, k=_SPLINE_DEGREE)
-            curves = angle, angle.derivative(), angle.derivative(2)
+            curves = _Curves(angle, angle.derivative(), angle.derivative(2))
             return cls(measured, space, curves, unsettled, band), note
         t = measured.t - measured.t[0]
         if measured.held:
             angle = CubicHermiteSpline(t, measured.gamma, rate)
-            curves = angle, angle.derivative(), angle.derivative(2)
+            curves = _Curves(angle, angle.derivative(), angle.derivative(2))
             return cls(measured, space, curves, 0, None), ""
         angle = make_interp_spline(t, measured.gamma, k=_SPLINE_DEGREE)
         rates = make_interp_spline(t, rate, k=_SPLINE_DEGREE)
-        curves = angle, rates, rates.derivative()
+        curves = _Curves(angle, rates, rates.derivative())
         return cls(measured, space, curves, min(_EDGE, len(t) // 4), None), ""
 
     def count_sines(self, samples: int, least: int) -> int:
@@ -162,7 +170,7 @@ class MeasuredPath:
         requirement = f"must last longer than {2.0 * cut * self.period:g} s"
         duration = float(np.ptp(self.measured.t))
         refuse_unless("identify", ("t", duration, len(times) > 1, requirement))
-        angles, rates, accelerations = self._at(times.ravel() + delay)
+        angles, rates, accelerations = self._evaluate_curves(times.ravel() + delay)
         quaternion = self._orientations(angles)
         body_rate, body_acceleration = self._star_motion(
             quaternion, rates, accelerations
@@ -183,7 +191,7 @@ class MeasuredPath:
         step = max(len(self.times) // ENERGY_POSES, 1)
         late_times = self.times[:, 0] + delay
         inside = (late_times >= self.times[0, 0]) & (late_times <= self.times[-1, -1])
-        angles, rates, _ = self._at(late_times[inside][::step])
+        angles, rates, _ = self._evaluate_curves(late_times[inside][::step])
         quaternion = _follow_orientations(self._space, angles, self.measured)
         zeros = np.zeros((len(angles), 3))
         _, acceleration = self._star_motion(quaternion, zeros, rates)
@@ -199,10 +207,10 @@ class MeasuredPath:
             samples=len(angles),
         )
 
-    def _at(self, times: Array) -> tuple[Array, Array, Array]:
+    def _evaluate_curves(self, times: Array) -> tuple[Array, Array, Array]:
         """Return angles, rates and accelerations at times [s], each shape (n, 3)."""
-        angle, rate, acceleration = self._curves
-        return angle(times), rate(times), acceleration(times)
+        curves = self._curves
+        return curves.angle(times), curves.rate(times), curves.acceleration(times)
 
     def _star_motion(
         self, quaternion: Array, rates: Array, accelerations: Array

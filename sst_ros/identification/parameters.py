@@ -92,7 +92,9 @@ def select_names(scene: Scene, requested: Iterable[str] | None) -> tuple[str, ..
     own, optional = _list_names(scene)
     if requested is None:
         return tuple(own)
-    beginnings = [requested] if isinstance(requested, str) else requested
+    beginnings: Iterable[object] = requested
+    if isinstance(requested, str):
+        beginnings = [requested]
     selectable = dict.fromkeys(own + optional)
     names: dict[str, None] = {}
     checks: list[Check] = []

@@ -198,7 +198,7 @@ class Signals:
 def _join(recorded: list[Series]) -> Series:
     """Put topics side by side at all stamps that any of them has.
 
-    A row was received when the first of them was that has this stamp.
+    The reception of a row is that of the first topic that has its stamp.
     """
     if len(recorded) == 1:
         return recorded[0]

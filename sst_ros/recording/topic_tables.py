@@ -492,13 +492,13 @@ def select_topics(
     node = present[0] if present else None
     names = dict[str, str]()
     for name, topic in bag.candidates.items():
-        own = {
-            EVERYBODY: True,
-            SIMULATOR_NODE: _parent(name) == node,
-            NAMESPACE: name == chosen.rstrip("/") + topic.ending,
-            CONTROLLER_NODE: False,
-        }
-        if own[topic.owner]:
+        if topic.owner == SIMULATOR_NODE:
+            is_own = _parent(name) == node
+        elif topic.owner == NAMESPACE:
+            is_own = name == chosen.rstrip("/") + topic.ending
+        else:  # topics of controllers follow
+            is_own = topic.owner == EVERYBODY
+        if is_own:
             names[topic.key] = name
     alone = len(spaces) == 1
     names |= _find_controllers(bag, heard, chosen, alone)

@@ -304,9 +304,9 @@ def _first_zeros(
         return np.asarray(getattr(_measure(scene, turn(axes, angles)), name))
 
     angles = np.linspace(0.0, np.pi, TURNS)
-    every = values(np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
-    sign = np.sign(every[0])
-    beyond = sign * every.reshape(len(axes), TURNS) <= 0.0
+    measures = values(np.repeat(axes, TURNS, axis=0), np.tile(angles, len(axes)))
+    sign = np.sign(measures[0])  # at the start
+    beyond = sign * measures.reshape(len(axes), TURNS) <= 0.0
     meets = beyond.any(axis=1) & ~beyond[:, 0]
     axes = axes[meets]
     first = beyond.argmax(axis=1)[meets]

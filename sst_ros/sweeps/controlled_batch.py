@@ -88,6 +88,7 @@ def uniform_numbers(
     earlier = np.uint64(2 * normal * sample)
     numbers = np.arange(1, 2 * normal + 1, dtype=np.uint64) + earlier
     bits = _mix(starts + (numbers * _SPLITMIX_STEP)[:, None])
+    # by the upper 53 bits, as many as a double has; in the middle of their steps
     uniform: Array = ((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
     return uniform
 
@@ -98,6 +99,7 @@ def normal_number(u: Any, v: Any) -> Any:
 
 
 def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return the bits that SplitMix64 makes of its states."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     mixed: NDArray[np.uint64] = x ^ (x >> np.uint64(31))
@@ -110,8 +112,8 @@ class Feedback(NamedTuple):
     answer: ColumnFunction  # the control law, see `ControlledBatch.answer`
     references: Sequence[tuple[float, ...]]  # of each sample
     hold: int  # steps from a sample to the next
-    memory: Array  # changes
-    gains: Array
+    memory: Array  # changes at each sample, see `ControlledBatch`
+    gains: Array  # see GAINS
     starts: NDArray[np.uint64]  # of the noise; none without noise
 
 
@@ -307,6 +309,7 @@ class ControlledBatch:
         return (*sent, *(number for name in self._memory_sizes for number in new[name]))
 
     def _inverse_dynamics(self, *motion: Any) -> Any:
+        """Return the torques of quaternion, W and W_dot by the controller's model."""
         torque, _ = kernel.actuator_torque(kernel.model_of(self._scene), *motion)
         return torque
 
@@ -422,6 +425,8 @@ class ControlledBatch:
         last = np.hstack([np.where(complete, final, 0.0), no_torque])
         largest = np.maximum(np.stack(rows["largest"], axis=1), np.abs(last))
         squares = np.stack(rows["squares"], axis=1) + last**2
+        # Errors count at the end, too, torques where a period begins: not at the end of
+        # a whole run.
         begun = np.floor(result.t / self._control.period + 1e-9)[:, None]
         sample_counts = np.hstack([begun + 1.0] * 3 + [begun + ~complete] * 3)
         error_rms, torque_rms = np.split(np.sqrt(squares / sample_counts), 2, axis=1)
@@ -474,17 +479,20 @@ class ControlledBatch:
 
         inertia = np.array(self._controller.inertia)[:, None]
         varies = {"control.stiffness", "control.damping"} & varied.keys()
-        rows = (
-            *law.feedback_gains(inertia, value, self._control.direct or bool(varies)),
-            inertia,
-            value("integral_rate"),
-            law.command_limit(value("torque_limit"), self._scene),
-            batch.columns.torque_limit,
-            value("angle_noise"),
-            value("rate_noise"),
-        )
+        direct = self._control.direct or bool(varies)
+        stiffness, damping = law.feedback_gains(inertia, value, direct)
+        noise = np.broadcast_arrays(value("angle_noise"), value("rate_noise"))
+        gains = {
+            "kp": stiffness,
+            "kd": damping,
+            "inertia": inertia,
+            "rate": value("integral_rate"),
+            "limit": law.command_limit(value("torque_limit"), self._scene),
+            "plant_limit": batch.columns.torque_limit,
+            "noise": noise,
+        }
         columns = []
-        for row in rows:
-            components = np.atleast_2d(row)
-            columns.append(np.broadcast_to(components, (len(components), count)))
+        for name, size in GAINS.items():
+            rows = np.reshape(gains[name], (size, -1))
+            columns.append(np.broadcast_to(rows, (size, count)))
         return np.concatenate(columns)
