@@ -25,7 +25,8 @@ DEMO_MODES = ("feedforward", "feedforward_pd")
 _HOLD_S = 0.3
 _DEMO_RATE = 500
 _READY_S = 60.0  # a first start compiles, on a busy machine for half a minute
-_DEMO_END_S = 30.0
+_DEMO_END_S = 100.0
+"""Time beside the run that a node may take: a busy machine starts one in 40 s."""
 
 
 def record(name: str, folder: Path) -> Path:

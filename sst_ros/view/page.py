@@ -45,7 +45,7 @@ _LARGEST_TORQUE = 5.0
 """Range of the torque sliders where the scene has no limit [N m]."""
 _SPEEDS = ("0.1 ×", "0.25 ×", "0.5 ×", "1 ×", "2 ×", "5 ×")
 _REFUSAL_S = 4.0
-"""Time for which a refusal is contents."""
+"""Time for which a refusal is shown."""
 _WINDOW_S = 10.0
 """Time that the plots show."""
 _CURVE_POINTS = 500
@@ -92,7 +92,7 @@ class _PlotSample(NamedTuple):
 
 
 class _PageContents(NamedTuple):
-    """A scene on the page, and what of the page changes while it is contents."""
+    """A scene on the page, and what of the page changes while it is shown."""
 
     scene: Scene
     drawing: SceneDrawing
