@@ -248,12 +248,7 @@ class Trajectory(MotionTable):
             ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
             ("run", run, isinstance(run, RunRecord), "must be a RunRecord"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
-            (
-                "gaps",
-                gaps,
-                are_spans,
-                "must be rising pairs of times [s], shape (g, 2)",
-            ),
+            ("gaps", gaps, are_spans, spans_requirement),
         ]
         for name, size in sizes.items():
             shape = vars(self)[name].shape
