@@ -153,7 +153,7 @@ class ColumnStep:
         """Return what a step gives.
 
         That is the new state, the distances to the limits and their rates, the largest
-        error so far of a step, and a flag. The flag is positive where a limit may have
+        error of all steps, and a flag. The flag is positive where a limit may have
         been passed, or a number is not finite.
         """
         distances_end = self.size + 2 * self.limits
