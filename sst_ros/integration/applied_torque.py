@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Torques that act at the actuators: the given ones, within the actuators' limit."""
+"""Torques that act at the actuators: the commanded ones within the limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import STATE_SIZE, Dynamics
 from sst_ros.integration.point import Drive
 from sst_ros.mechanism.generic_math import triple
 from sst_ros.mechanism.geometry import Array
@@ -25,36 +25,36 @@ from sst_ros.state import (
     clamp,
 )
 
-_SEARCHED = 8
-"""Parts of a step in which a jump is looked for."""
+_SEARCHED_PARTS = 8
+"""Parts of a step, of which the one with the largest change is searched for a jump."""
+_JUMP_SHARE = 0.5
+"""Share of a change that remains while a part is halved, if the change is a jump."""
 _TIME_STEP = 1e-7
-"""Step of the derivative of a torque by time [s].
+"""Step of the difference by time of a function's torques [s].
 
-Its error is 1e-9 where the torque changes within 1 ms.
+The relative error is 1e-9 where a torque changes within 1 ms.
 """
 _STATE_STEP = 1e-7
-"""Step of its derivatives by the state, relative to numbers above 1.
+"""Step of the differences by the state, relative to numbers above 1.
 
 Half of the digits remain.
 """
 CHECKED_POINTS = 32
-"""Parts of a step at whose ends a function of the time is looked at.
+"""Parts of a step at whose ends a function of the time is evaluated to find pulses.
 
-A pulse that is longer than one of them is met.
+A pulse that is longer than a part is met.
 """
 _PULSE = 1e-3
-"""Deviation from the neighbours that may be a jump, relative to the largest torque."""
+"""Least deviation from the neighbours, relative to the largest torque, of a pulse."""
 _SMOOTH_PULSE = 0.1
-"""...and one that is a smooth pulse, as no jump is found."""
+"""Least deviation, alike, of a pulse for which a step is shortened without a jump."""
 _NOT_FINITE = (math.nan, math.nan, math.nan)
-
-
 _EXTRAPOLATION = np.array([4.0, -6.0, 4.0, -1.0])
 """Weights of four evenly spaced values in the one before them, by a cubic."""
 
 
 class Pulse(NamedTuple):
-    """Where a torque does not follow from its neighbours."""
+    """Span of time in a step in which torques do not follow from their neighbours."""
 
     begin: float  # time of the steps [s]
     end: float
@@ -62,7 +62,7 @@ class Pulse(NamedTuple):
 
 
 class AppliedTorque:
-    """What the actuators give of a torque: it, within their limit.
+    """Torques that the actuators give: the commanded ones within their limit.
 
     Args:
         dynamics: of the scene.
@@ -73,10 +73,10 @@ class AppliedTorque:
     def __init__(self, dynamics: Dynamics, limit: float | None) -> None:
         self._dynamics = dynamics
         self.limit = limit
-        self._lags = len(dynamics.state) > 7
+        self._lags = len(dynamics.state) > STATE_SIZE
 
     def acting(self, torque: Torque) -> Torque:
-        """Return what acts: torques that are held within the limit, others as given."""
+        """Return constant torques within the limit, and other torques as they are."""
         constant_torque = torque.held if isinstance(torque, TorqueProfile) else torque
         if constant_torque is None:
             return torque
@@ -91,7 +91,7 @@ class AppliedTorque:
         return limit
 
     def at(self, torque: Torque, time: float, y: Sequence[float]) -> Vector3:
-        """Torques that act at a time [s] and a state y, within the limit [N m].
+        """Return the torques within the limit at a time [s] and a state y [N m].
 
         Raises:
             InputError: what a function returns is not three finite numbers.
@@ -110,12 +110,12 @@ class AppliedTorque:
         y: Sequence[float],
         joints: Sequence[float],
     ) -> Vector3:
-        """Torques with feedback at a time [s] and a state y with its joints [N m].
+        """Return torques with feedback at a time [s] and a state with its joints [N m].
 
-        In the state that a function is given are the lagged torques of the actuators;
-        without lag zero, for torques of this instant are what it returns. Where the
-        state is not finite, as in a trial step that is too long, it is not called, and
-        the torques are nan.
+        The `State` that a function gets has the torques of the actuators where they
+        lag, and zero where they do not, as the function itself gives those. It is not
+        called where the state is not finite, as in a trial step that is too long: the
+        torques are nan.
         """
         if not math.isfinite(sum(y)):
             return _NOT_FINITE
@@ -126,7 +126,7 @@ class AppliedTorque:
     def at_times(
         self, torque: TorqueProfile, times: Sequence[float]
     ) -> Sequence[Vector3]:
-        """Torques without feedback that act at times [s], within the limit [N m]."""
+        """Return torques without feedback at times [s], within the limit [N m]."""
         torques = torque.at_times(times)
         limit = self.limit
         if limit is None:
@@ -136,7 +136,7 @@ class AppliedTorque:
     def of_drive(self, drive: Drive, t: float, y: Sequence[float]) -> Vector3:
         """Return the torques of a drive with a function [N m].
 
-        They are those at a time of the steps [s] and a state.
+        Time is that of the steps [s].
         """
         assert drive.function is not None
         return self.at(drive.function, drive.start + t, y)
@@ -144,48 +144,47 @@ class AppliedTorque:
     def locate_jump(
         self, drive: Drive, begin: float, end: float, y: Sequence[float]
     ) -> tuple[float, float] | None:
-        """Locate a jump of a function's torques: the last time before, the first after.
+        """Locate a jump of a function's torques between two times of the steps [s].
 
         Bisection keeps the half with the larger change: that of a jump stays, any other
         shrinks (Gear & Osterby, ACM Trans. Math. Softw. 10 (1984) 23-44, locate them
-        for the same purpose).
+        for the same purpose). All torques are those at the state y.
 
-        Between two times of the steps [s], at the same state y.
+        Returns:
+            The last time before the jump and the first after it; None without a jump.
+
         """
-        times = np.linspace(begin, end, _SEARCHED + 1).tolist()
+        times = np.linspace(begin, end, _SEARCHED_PARTS + 1).tolist()
         torques = [self.of_drive(drive, time, y) for time in times]
         changes = [math.dist(before, after) for before, after in pairwise(torques)]
         largest = max(changes)
         k = changes.index(largest)
         low, high = times[k], times[k + 1]
         before, after = torques[k], torques[k + 1]
-        while low < (middle := 0.5 * (low + high)) < high:
+        middle = 0.5 * (low + high)
+        while low < middle < high:  # until the two times are neighbours as doubles
             torque = self.of_drive(drive, middle, y)
             if math.dist(before, torque) >= math.dist(torque, after):
-                high, after = middle, torque
+                high = middle
+                after = torque
             else:
-                low, before = middle, torque
-            if not math.dist(before, after) > 0.5 * largest:
+                low = middle
+                before = torque
+            if not math.dist(before, after) > _JUMP_SHARE * largest:
                 return None
+            middle = 0.5 * (low + high)
         return low, high
 
     def find_pulse(self, drive: Drive, t: float, h: float) -> Pulse | None:
-        """Find where a function of the time does not follow from its neighbours.
+        """Find where torques over time do not follow from their neighbours in a step.
 
-        Each of evenly spaced torques in a step is compared with the cubic polynomial
-        through two on either side, or through four on one side near the ends. At the
-        ends themselves are stages.
+        The step is from t [s] of the steps on, h [s] long.
         """
         assert drive.function is not None
         spacing = h / CHECKED_POINTS
         times = [drive.start + t + spacing * k for k in range(CHECKED_POINTS + 1)]
         torques = np.array(self.at_times(drive.function, times))
-        expected = torques.copy()
-        inner = 4.0 * (torques[1:-3] + torques[3:-1]) - torques[:-4] - torques[4:]
-        expected[2:-2] = inner / 6.0
-        expected[1] = _EXTRAPOLATION @ torques[2:6]
-        expected[-2] = _EXTRAPOLATION @ torques[-3:-7:-1]
-        deviations = np.abs(torques - expected).max(axis=1)
+        deviations = np.abs(torques - _expect_torques(torques)).max(axis=1)
         k = int(deviations.argmax())
         largest = float(np.abs(torques).max())
         deviation = float(deviations[k])
@@ -202,24 +201,37 @@ class AppliedTorque:
         The difference is forward from `torque`, as a step may begin at a kink, behind
         which the torque has another rate.
         """
-        torque_after_one, torque_after_two = (
-            np.array(self.of_drive(drive, t + k * _TIME_STEP, y)) for k in (1, 2)
-        )
-        return np.asarray(
-            (4.0 * torque_after_one - torque_after_two - 3.0 * np.array(torque))
-            / (2.0 * _TIME_STEP)
-        )
+        after_one = np.array(self.of_drive(drive, t + _TIME_STEP, y))
+        after_two = np.array(self.of_drive(drive, t + 2.0 * _TIME_STEP, y))
+        difference = 4.0 * after_one - after_two - 3.0 * np.array(torque)
+        return np.asarray(difference / (2.0 * _TIME_STEP))
 
     def by_state(
         self, drive: Drive, t: float, y: Sequence[float], torque: Vector3
     ) -> Array:
         """Differentiate a function's torques by the state, shape (3, size)."""
         slopes = np.zeros((3, len(y)))
-        if drive.function is not None and drive.function.feedback:
-            # the last number is the work, which no torque sees
-            for i in range(len(y) - 1):
-                step = _STATE_STEP * max(1.0, abs(y[i]))
-                moved = [*y[:i], y[i] + step, *y[i + 1 :]]
-                change = np.array(self.of_drive(drive, t, moved)) - torque
-                slopes[:, i] = change / step
+        if drive.function is None or not drive.function.feedback:
+            return slopes
+        # No torque depends on the work, the last number.
+        for i in range(len(y) - 1):
+            step = _STATE_STEP * max(1.0, abs(y[i]))
+            moved = list(y)
+            moved[i] += step
+            change = np.array(self.of_drive(drive, t, moved)) - torque
+            slopes[:, i] = change / step
         return slopes
+
+
+def _expect_torques(torques: Array) -> Array:
+    """Return evenly spaced torques as they follow from their neighbours, shape (n, 3).
+
+    Each is that of the cubic polynomial through two on either side, or through four on
+    one side near the ends. The first and the last, at which stages are, are as given.
+    """
+    expected: Array = torques.copy()
+    inner = 4.0 * (torques[1:-3] + torques[3:-1]) - torques[:-4] - torques[4:]
+    expected[2:-2] = inner / 6.0
+    expected[1] = _EXTRAPOLATION @ torques[2:6]
+    expected[-2] = _EXTRAPOLATION @ torques[-3:-7:-1]
+    return expected

@@ -7,8 +7,8 @@ components.
 
 from __future__ import annotations
 
+import math
 import os
-from collections import deque
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -20,27 +20,29 @@ from sst_ros.dynamics.initial_state import NO_ASSEMBLY, NO_RATE, initial_states
 from sst_ros.dynamics.model import limits_of
 from sst_ros.dynamics.motion_table import MotionTable
 from sst_ros.dynamics.traced_dynamics import (
+    STATE_SIZE,
     TORQUE_SYMBOLS,
     ParameterColumns,
     ParametricModel,
 )
-from sst_ros.errors import check_kinds, read_numbers, refuse_unless
+from sst_ros.errors import Check, check_kinds, read_numbers, refuse_unless
 from sst_ros.integration.batch_session import BatchSession
 from sst_ros.integration.batch_step import (
-    EARLIEST,
     LANE_BLOCK,
     NOT_FINITE_CODE,
     Advance,
     Block,
+    Columns,
     ColumnStep,
     Endings,
     advance_blocks,
     locate_ends,
+    steps_of_ends,
+    whole_lanes,
 )
 from sst_ros.integration.many_runs import run_many
 from sst_ros.integration.methods import DOP853, Tableau
 from sst_ros.mechanism.geometry import Array
-from sst_ros.programs.llvm import LANES
 from sst_ros.progress import slices
 from sst_ros.scene.scene import Scenarios, Scene, SceneInput, scene_of
 from sst_ros.scene.schema import FULL_TURN
@@ -67,10 +69,12 @@ All numbers of the program are arrays of this length.
 """
 
 _MOST_BATCH_STEPS = 10**9
-"""Steps of a run."""
+"""Most steps of a run."""
 
 _THREAD_COLUMNS = 64
 """Columns that are worth a thread of their own."""
+_SHARES_OF_A_THREAD = 4
+"""Shares of the blocks that a thread takes one after the other, as some take longer."""
 
 OUTSIDE_STATUS = -3
 _REASONS = {
@@ -80,13 +84,13 @@ _REASONS = {
     OUTSIDE_STATUS: "initial gamma outside the stroke",
     NOT_FINITE_CODE: "not finite",
 }
-"""How a scenario ended, by the codes that are no limit's.
+"""How a scenario ended, by its code, where no limit ended it.
 
-Below zero it did not start.
+With a code below zero it did not start.
 """
 
 _SCENARIO = {"status": "", "message": "", "fault_time": "s", "local_error": ""}
-"""What is known of a scenario beside its motion, with units."""
+"""Attributes of a result that are one number or text a scenario, with units."""
 
 
 class Batch(Explained):
@@ -98,7 +102,7 @@ class Batch(Explained):
     Args:
         scene: what is simulated.
         method: explicit method.
-        profile: apply the scene's own torques over time on top of none given to `run`.
+        profile: apply the scene's own torques over time; `run` is given none then.
         parameters: numbers of the scene that differ between scenarios, by their keys in
             the document, as in {"star.inertia.zz": [...], "gravity.acceleration":
             [[...], ...]}: a row a scenario. A list without an index means all of its
@@ -124,21 +128,17 @@ class Batch(Explained):
         parameters: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         scene = scene_of(scene)
-        unused = (
-            _UNUSED if profile else {**_UNUSED, "torque": "acts with profile=True only"}
-        )
-        requirements = {
-            key: unused.get(key.partition(".")[0], "") for key in parameters or ()
-        }
-        torque = not profile or scene.torque is not None
-        refuse_unless(
-            scene.name,
-            *(
-                (key, "given", not requirement, requirement)
-                for key, requirement in requirements.items()
-            ),
-            ("torque", None, torque, "must be given in the scene for its profile"),
-        )
+        unused = dict(_UNUSED)
+        if not profile:
+            unused["torque"] = "acts with profile=True only"
+        has_torque = not profile or scene.torque is not None
+        checks: list[Check] = []
+        for key in parameters or ():
+            section = key.partition(".")[0]
+            is_used = section not in unused
+            checks.append((key, "given", is_used, unused.get(section, "")))
+        requirement = "must be given in the scene for its profile"
+        refuse_unless(scene.name, *checks, ("torque", None, has_torque, requirement))
         self.scene = scene
         self._method = method
         self._scenarios = Scenarios(scene, parameters or {})
@@ -217,42 +217,43 @@ class Batch(Explained):
 
         """
         requirement = f"must be >= 0 and <= {_MOST_BATCH_STEPS:g}"
+        checks = [_check_step(step)]
         whole_numbers = {"count": count, "keep_every": keep_every, "threads": threads}
-        refuse_unless(
-            "batch",
-            ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
-            *(
-                (name, n, 0 <= n <= _MOST_BATCH_STEPS, requirement)
-                for name, n in whole_numbers.items()
-            ),
-        )
+        for name, n in whole_numbers.items():
+            checks.append((name, n, 0 <= n <= _MOST_BATCH_STEPS, requirement))
+        refuse_unless("batch", *checks)
         step = float(step)
         count = int(count)
         loop = advance or partial(self.advance, threads=threads)
         y, code = self.initial(gamma, gamma_dot)
         number = y.shape[1]
-        drives = self.drives(torque, number)
-        time = np.full(number, np.nan)
-        error = np.zeros(number)
+        columns = Columns(
+            y=y,
+            drives=self.drives(torque, number),
+            code=code,
+            time=np.full(number, np.nan),
+            error=np.zeros(number),
+        )
         kept = [y.copy()]
         ends = [0]
-        # few calls: each passes all rows
-        size = keep_every or (0 if progress else max(count, 1))
+        size = keep_every
+        if not keep_every and not progress:
+            size = max(count, 1)  # one call: each passes all rows
         for step_range in slices(count, size, self.scene.name, progress):
             span = step_range.stop - step_range.start
-            loop(step_range.start, span, step, y, drives, code, time, error, rows=None)
+            loop(step_range.start, span, step, *columns, rows=None)
             if keep_every and span == keep_every:
                 kept.append(y.copy())
                 ends.append(step_range.stop)
-        time[code < 0] = 0.0
+        columns.time[code < 0] = 0.0
         # A step in which a limit was passed is left out: its beginning is the last
         # valid state.
-        begins = np.asarray(np.ceil(time / step - 0.1 * EARLIEST) - 1.0)
-        steps = np.where(code > 0, begins, count)
+        steps = np.where(code > 0, steps_of_ends(columns.time, step), count)
         steps[code < 0] = 0
-        locate_ends(loop, step, steps, y, drives, code, time)
+        locate_ends(loop, step, steps, columns)
         last = steps * step
-        endings = Endings(drives[TORQUES].T, code, time, error)
+        torques = columns.drives[TORQUES].T
+        endings = Endings(torques, code, columns.time, columns.error)
         result = self.result_of(endings, last, y)
         if keep_every:
             samples = np.minimum.outer(step * np.array(ends, dtype=float), last)
@@ -290,18 +291,13 @@ class Batch(Explained):
                 torques.
 
         """
-        requirement = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
-        torque = self.model.ode.drive[TORQUES] == TORQUE_SYMBOLS
+        allowed_range = f"must be >= 1 and <= {_MOST_BATCH_STEPS:g}"
+        no_profile = "must be False: the torques are given step by step"
         refuse_unless(
             "batch",
-            ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]"),
-            ("substeps", substeps, 1 <= substeps <= _MOST_BATCH_STEPS, requirement),
-            (
-                "profile",
-                True,
-                torque,
-                "must be False: the torques are given step by step",
-            ),
+            _check_step(step),
+            ("substeps", substeps, 1 <= substeps <= _MOST_BATCH_STEPS, allowed_range),
+            ("profile", True, self._takes_torques, no_profile),
         )
         return BatchSession(self, gamma, gamma_dot, float(step), int(substeps))
 
@@ -311,21 +307,19 @@ class Batch(Explained):
         gamma_dot: ArrayLike,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, NDArray[np.int64]]:
-        """States at t = 0, a column a scenario, and codes: 0, or why one cannot start.
+        """Return states at t = 0, a column a scenario, and codes.
 
-        Only the scenarios `rows` start, all by default.
+        A code is 0, or why a scenario cannot start. Only the scenarios `rows` start, by
+        default all.
         """
         columns = self.columns
         count = self._scenarios.count if rows is None else len(rows)
-        # One start for all is solved once.
-        alike = (
-            rows is None
-            and np.ndim(gamma)
-            == np.ndim(gamma_dot)
-            == columns.geometries.alpha.ndim
-            == 1
-        )
-        angles = _rows("gamma", gamma, 1 if alike and count else count)
+        # One start for all is solved once, and copied.
+        is_one_geometry = columns.geometries.alpha.ndim == 1
+        is_one_start = np.ndim(gamma) == 1 and np.ndim(gamma_dot) == 1
+        is_alike = rows is None and is_one_geometry and is_one_start
+        copies = count if is_alike else None
+        angles = _rows("gamma", gamma, 1 if copies else count)
         rates = _rows("gamma_dot", gamma_dot, len(angles))
         geometry_rows = columns.geometry
         if rows is not None and len(geometry_rows) > 1:
@@ -333,29 +327,33 @@ class Batch(Explained):
         geometry_rows = np.broadcast_to(geometry_rows[: len(angles)], len(angles))
         start, code = initial_states(columns.geometries, geometry_rows, angles, rates)
         if self.scene.stroke.at_end == "stop":
-            outside = (angles < 0.0) | (
-                angles > columns.geometries.of_rows(geometry_rows).arc
-            )
+            arcs = columns.geometries.of_rows(geometry_rows).arc
+            outside = (angles < 0.0) | (angles > arcs)
             code[outside.any(axis=1)] = OUTSIDE_STATUS
         y = np.zeros((len(self.model.ode.state), len(angles)))
         y[STAR] = start
-        if alike and count:
-            y = np.repeat(y, count, axis=1)
-            code = np.repeat(code, count)
+        if copies:
+            y = np.repeat(y, copies, axis=1)
+            code = np.repeat(code, copies)
         return y, code
 
     def drives(self, torque: ArrayLike, number: int) -> Array:
-        """Return what acts from outside and what differs, a column a scenario."""
-        drive = self.model.ode.drive
-        columns = self.columns.inputs
-        drive_rows = np.zeros((max(len(drive) + len(columns), 1), number))
-        if drive[TORQUES] == TORQUE_SYMBOLS:
+        """Return what acts from outside and what varies, a column a scenario."""
+        drive_size = len(self.model.ode.drive)
+        varied = self.columns.inputs
+        size = drive_size + len(varied)
+        drives = np.zeros((max(size, 1), number))
+        if self._takes_torques:
             limit = self.columns.torque_limit
-            drive_rows[TORQUES] = np.clip(
-                _rows("torque", torque, number).T, -limit, limit
-            )
-        drive_rows[len(drive) : len(drive) + len(columns)] = columns
-        return drive_rows
+            torques = _rows("torque", torque, number)
+            drives[TORQUES] = np.clip(torques.T, -limit, limit)
+        drives[drive_size:size] = varied
+        return drives
+
+    @property
+    def _takes_torques(self) -> bool:
+        """Whether torques are given: not where the scene's profile is traced."""
+        return bool(self.model.ode.drive[TORQUES] == TORQUE_SYMBOLS)
 
     def advance(
         self,
@@ -366,12 +364,10 @@ class Batch(Explained):
         threads: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> None:
-        """Advance by `count` steps from step `first`.
+        """Advance by `count` steps of `step` [s] from step `first`; see `Advance`.
 
-        Y, given, code, time and error change.
-
-        Threads take several blocks in turn, more shares than threads; the interpreter's
-        lock is released in each step. A few `rows` need no threads.
+        Threads take several blocks in turn; the interpreter's lock is released in each
+        step. A few `rows` need no threads.
         """
         threads = threads or len(os.sched_getaffinity(0))
         if rows is not None:
@@ -379,7 +375,8 @@ class Batch(Explained):
         number = columns[0].shape[1]
         width = block_width(number, threads)
         begins = range(0, number, width)
-        size = max(1, -(-len(begins) // (1 if threads == 1 else 4 * threads)))
+        shares = 1 if threads == 1 else _SHARES_OF_A_THREAD * threads
+        size = max(1, math.ceil(len(begins) / shares))
         thread_shares = [begins[i : i + size] for i in range(0, len(begins), size)]
 
         programs = self.programs  # compiled here, not by each thread
@@ -389,7 +386,8 @@ class Batch(Explained):
                 Block(programs, width), block_begins, first, count, step, *columns
             )
 
-        deque(run_many(advance_share, thread_shares, workers=threads), maxlen=0)
+        for _ in run_many(advance_share, thread_shares, workers=threads):
+            pass
 
     @cached_property
     def programs(self) -> ColumnStep:
@@ -399,11 +397,10 @@ class Batch(Explained):
 
 def block_width(number: int, threads: int = 1) -> int:
     """Return how many of a number of columns are advanced together."""
-    blocks = max(
-        -(-number // LANE_BLOCK), min(threads, -(-number // _THREAD_COLUMNS)), 1
-    )
-    width = -(-number // blocks)
-    return max(1, -(-width // LANES)) * LANES
+    least_blocks = math.ceil(number / LANE_BLOCK)
+    worth_threads = min(threads, math.ceil(number / _THREAD_COLUMNS))
+    blocks = max(least_blocks, worth_threads, 1)
+    return whole_lanes(max(1, math.ceil(number / blocks)))
 
 
 def _make_batch(
@@ -412,7 +409,12 @@ def _make_batch(
     return Batch(scene, method, profile=profile, parameters=parameters)
 
 
+def _check_step(step: float) -> Check:
+    return ("step", step, 0.0 < step < np.inf, "must be finite and > 0 [s]")
+
+
 def _rows(name: str, value: ArrayLike, count: int | None) -> Array:
+    """Return three numbers for each of `count` scenarios, or for as many as given."""
     rows = read_numbers("batch", name, value)
     if count is not None and rows.shape == (3,):
         rows = np.tile(rows, (count, 1))
@@ -468,9 +470,8 @@ class BatchResult(MotionTable):
         self.code = code
         self.fault_time = endings.fault_time
         self.local_error = endings.local_error
-        self.status = np.where(
-            (code < 0) | (code == NOT_FINITE_CODE), -1, np.sign(code)
-        )
+        has_failed = (code < 0) | (code == NOT_FINITE_CODE)
+        self.status = np.where(has_failed, -1, np.sign(code))
         self.t = t
         self._state = np.moveaxis(y, -2, -1)
         self.quaternion: Array = self._state[..., QUATERNION]
@@ -487,6 +488,7 @@ class BatchResult(MotionTable):
         return self._joint("energy")[..., 0]
 
     def _joint(self, name: str) -> Array:
+        """Return an output of the model for all states, computed once."""
         if name not in self._computed:
             function = self._model.outputs[name]
             inputs = self._columns.inputs
@@ -507,15 +509,19 @@ class BatchResult(MotionTable):
     @cached_property
     def torque(self) -> Array:
         """Torques that act at the actuators [N m], shape (..., N, 3)."""
-        if self._state.shape[-1] > 7:
+        if self._state.shape[-1] > STATE_SIZE:
             return self._state[..., LAGGED_TORQUES]
         if self.sent is not None:
             return self.sent
         profile = self._model.constants(list(self._columns.inputs)).torque
         if profile is None:
             return np.broadcast_to(self._torque, self.body_rate.shape)
-        rows = zip(profile.amplitude, profile.frequency, profile.phase, strict=True)
-        return np.stack([a * np.sin(f * self.t + p) for a, f, p in rows], axis=-1)
+        torques = []
+        for amplitude, frequency, phase in zip(
+            profile.amplitude, profile.frequency, profile.phase, strict=True
+        ):
+            torques.append(amplitude * np.sin(frequency * self.t + phase))
+        return np.stack(torques, axis=-1)
 
     @property
     def success(self) -> NDArray[np.bool_]:
@@ -538,10 +544,9 @@ class BatchResult(MotionTable):
         # only these depend on the geometry
         limited = (self.code > 0) & (self.code < NOT_FINITE_CODE)
         # One number for each pair, as np.unique is slow with pairs: a tenth of the time
-        # of a sweep.
-        geometry_and_code = (
-            np.where(limited, geometry, 0) * 4 * NOT_FINITE_CODE + self.code
-        )
+        # of a sweep. Codes are less than 2 NOT_FINITE_CODE from zero.
+        own_geometry = np.where(limited, geometry, 0)
+        geometry_and_code = 4 * NOT_FINITE_CODE * own_geometry + self.code
         _, first, index = np.unique(
             geometry_and_code, return_index=True, return_inverse=True
         )
@@ -556,11 +561,10 @@ class BatchResult(MotionTable):
         return {name: (getattr(self, name), unit) for name, unit in _SCENARIO.items()}
 
     def _facts(self) -> dict[str, object]:
+        span = f"{self.t.min():g} to {self.t.max():g}" if self.t.size else "none"
         return {
             "scene": self.scene.name,
             "scenarios": len(self),
             "ended early": np.count_nonzero(self.status),
-            "time [s]": f"{self.t.min():g} to {self.t.max():g}"
-            if self.t.size
-            else "none",
+            "time [s]": span,
         }

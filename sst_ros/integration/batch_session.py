@@ -18,27 +18,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_ros.errors import check_kinds, check_kinds_late, refuse_unless
 from sst_ros.integration.batch_step import (
-    EARLIEST,
     Block,
+    Columns,
     Endings,
     locate_ends,
     spaced_rows,
+    steps_of_ends,
+    whole_lanes,
 )
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.columns import compile_columns
 from sst_ros.programs.expression import trace
-from sst_ros.programs.llvm import LANES
 from sst_ros.state import QUATERNION, STAR, STAR_RATE, TORQUES
 
 _GAMMA = slice(3)
 _GAMMA_DOT = slice(3, 6)
 """Rows of the joints that a session computes."""
+_JOINT_ROWS = _GAMMA_DOT.stop
 _WORTH_A_THREAD = 512
-"""Robots: their step takes ten times as long as to wake a thread."""
+"""Robots that are worth a thread: their step takes ten times as long as to wake it."""
+_LOCATED = -1
+"""In place of the steps at the last reset of a robot whose end has been located."""
 
 
 class BatchState(NamedTuple):
-    """State of all robots, a row each: views of arrays that the next step changes."""
+    """State of all robots, a row each, in arrays that the next step changes."""
 
     gamma: Array  #: actuator angles [rad], shape (N, 3)
     gamma_dot: Array  #: their rates [rad/s], shape (N, 3)
@@ -72,36 +76,41 @@ class BatchSession:
         self._batch = batch
         self._h = step / substeps
         self._substeps = substeps
-        self._y, code = batch.initial(gamma, gamma_dot)
-        self._start, self._start_code = self._y.copy(), code.copy()
+        y, code = batch.initial(gamma, gamma_dot)
         number = len(code)
-        self._angles, self._rates = self._spread(gamma), self._spread(gamma_dot)
-        self._drives = batch.drives((0.0, 0.0, 0.0), number)
+        self._start = y.copy()
+        self._start_code = code.copy()
+        self._angles = _spread(gamma, number)
+        self._rates = _spread(gamma_dot, number)
         self._torque_limit = batch.columns.torque_limit
         self.fault_time = np.full(number, np.nan)
-        self._error = np.zeros(number)
+        self._columns = Columns(
+            y=y,
+            drives=batch.drives((0.0, 0.0, 0.0), number),
+            code=code,
+            time=self.fault_time,
+            error=np.zeros(number),
+        )
         self._steps_done = 0
-        self._begun = np.zeros(number, dtype=np.int64)  # steps done at the last reset
+        # steps done at the last reset, or _LOCATED
+        self._begun = np.zeros(number, dtype=np.int64)
         workers = min(len(os.sched_getaffinity(0)), max(1, number // _WORTH_A_THREAD))
-        width = math.ceil(math.ceil(number / workers) / LANES) * LANES
-        column_ranges = [
-            slice(begin, begin + width) for begin in range(0, number, width)
-        ]
-        joints = spaced_rows(_GAMMA_DOT.stop, width * len(column_ranges))
+        width = whole_lanes(math.ceil(number / workers))
+        begins = range(0, number, width)
+        joints = spaced_rows(_JOINT_ROWS, width * len(begins))
         self.state = BatchState(
             joints[_GAMMA, :number].T,
             joints[_GAMMA_DOT, :number].T,
-            self._y[QUATERNION].T,
-            self._y[STAR_RATE].T,
+            y[QUATERNION].T,
+            y[STAR_RATE].T,
             code,
         )
-        self._columns = self._y, self._drives, code, self.fault_time, self._error
-        self._robots = [
-            _Robots(batch, column_range, joints[:, column_range])
-            for column_range in column_ranges
-        ]
+        self._robots: list[_Robots] = []
+        for begin in begins:
+            column_range = slice(begin, begin + width)
+            self._robots.append(_Robots(batch, column_range, joints[:, column_range]))
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
-        self._each(lambda robots: robots.load(*self._columns))
+        self._each(lambda robots: robots.load(self._columns))
 
     @check_kinds_late
     def step(self, torque: ArrayLike) -> BatchState:
@@ -122,7 +131,7 @@ class BatchSession:
         first = self._steps_done * self._substeps
 
         def advance(robots: _Robots) -> None:
-            robots.advance(first, self._substeps, self._h, *self._columns)
+            robots.advance(first, self._substeps, self._h, self._columns)
 
         self._each(advance)
         ended = np.flatnonzero((self.state.code > 0) & (self._begun >= 0))
@@ -133,15 +142,14 @@ class BatchSession:
 
     def _take_torques(self, torque: Any) -> None:
         """Write torques into the columns, clamped to the limit of the actuators."""
-        rows = self._drives[TORQUES]
-        plain = type(torque) is np.ndarray and torque.dtype == float
-        if plain and torque.shape == rows.T.shape and np.isfinite(torque).all():
+        rows = self._columns.drives[TORQUES]
+        is_plain = type(torque) is np.ndarray and torque.dtype == float
+        if is_plain and torque.shape == rows.T.shape and np.isfinite(torque).all():
             np.minimum(torque.T, self._torque_limit, out=rows)
             np.maximum(rows, -self._torque_limit, out=rows)
         else:
-            rows[:] = self._batch.drives(torque, rows.shape[1])[
-                TORQUES
-            ]  # or refuses them
+            drives = self._batch.drives(torque, rows.shape[1])  # or refuses them
+            rows[:] = drives[TORQUES]
 
     @check_kinds
     def reset(
@@ -172,9 +180,9 @@ class BatchSession:
             self._angles[index] = angles
             self._rates[index] = rates
         code = self._start_code[index]
-        self._y[:, index] = self._start[:, index]
+        self._columns.y[:, index] = self._start[:, index]
+        self._columns.error[index] = 0.0
         self.state.code[index] = code
-        self._error[index] = 0.0
         self.fault_time[index] = np.where(code < 0, 0.0, np.nan)
         self._begun[index] = self._steps_done
         for robots in self._robots:
@@ -203,37 +211,30 @@ class BatchSession:
 
     def result(self) -> Any:
         """Return a copy of all states, with every quantity of a `BatchResult`."""
-        time = (
-            (self._steps_done - np.maximum(self._begun, 0)) * self._substeps * self._h
+        columns = self._columns
+        endings = Endings(
+            torque=columns.drives[TORQUES].T.copy(),
+            code=columns.code.copy(),
+            fault_time=columns.time.copy(),
+            local_error=columns.error.copy(),
         )
-        batch = self._batch
-        code = self.state.code.copy()
-        fault = self.fault_time.copy()
-        torque = self._drives[TORQUES].T.copy()
-        last = np.where(np.isnan(fault), time, fault)
-        endings = Endings(torque, code, fault, self._error.copy())
-        return batch.result_of(endings, last, self._y.copy())
+        run_time = (self._steps_done - self._begun) * self._substeps * self._h
+        runs_on = np.isnan(columns.time)
+        last = np.where(runs_on, run_time, columns.time)
+        return self._batch.result_of(endings, last, columns.y.copy())
 
     def _locate(self, rows: NDArray[np.intp]) -> None:
         """Find when robots that ended in this step did so, from their last reset on."""
-        time = self.fault_time[rows]
-        code = self.state.code[rows]
-        begins = np.ceil(time / self._h - 0.1 * EARLIEST) - 1.0
-        y = np.ascontiguousarray(self._y[:, rows])
-        drives = np.ascontiguousarray(self._drives[:, rows])
-        locate_ends(self._batch.advance, self._h, begins, y, drives, code, time)
-        self.state.code[rows] = code
-        self.fault_time[rows] = time - self._begun[rows] * self._substeps * self._h
-        self._begun[rows] = -1
-
-    def _spread(self, values: ArrayLike) -> Array:
-        spread: Array = np.broadcast_to(
-            np.asarray(values, dtype=float), (self._y.shape[1], 3)
-        ).copy()
-        return spread
+        ended = self._columns.of_rows(rows)
+        steps = steps_of_ends(ended.time, self._h)
+        locate_ends(self._batch.advance, self._h, steps, ended)
+        reset_time = self._begun[rows] * self._substeps * self._h
+        self.state.code[rows] = ended.code
+        self.fault_time[rows] = ended.time - reset_time
+        self._begun[rows] = _LOCATED
 
     def _each(self, work: Callable[[_Robots], None]) -> None:
-        """Do something with all robots, by threads where that is worth it."""
+        """Call a function for the robots of each thread."""
         if self._pool is None:
             work(self._robots[0])
             return
@@ -246,7 +247,7 @@ class _Robots:
 
     Args:
         batch: whose robots they are.
-        part: their columns.
+        column_range: their columns.
         joints: where their actuator angles and rates go, shape (6, width of the block).
 
     """
@@ -256,47 +257,53 @@ class _Robots:
         self._joints = joints
         self._block = Block(batch.programs, joints.shape[1])
         self._varied = self._block.given[batch.programs.varied]
-        self._program = joints_of(batch)
-        self._measure = [
-            self._program.bind(
-                [*self._block.states(buffer)[STAR], *self._varied], [*joints]
-            )
-            for buffer in (0, 1)
-        ]
+        self._compute_joints = joints_of(batch)
+        # for each of the two arrays of states
+        self._update_joints = []
+        for buffer in (0, 1):
+            inputs = [*self._block.states(buffer)[STAR], *self._varied]
+            self._update_joints.append(self._compute_joints.bind(inputs, [*joints]))
 
-    def load(self, *columns: NDArray[Any]) -> None:
+    def load(self, columns: Columns) -> None:
         """Take over states."""
-        self._block.load(self._column_range, *columns)
-        self._measure[self._block.now]()
+        self._block.load(self._column_range, columns)
+        self._update_joints[self._block.now]()
 
     def replace(
         self, rows: NDArray[np.intp], start: Array, code: NDArray[np.int64]
     ) -> None:
         """Begin again in those of the rows that are here, from columns of states."""
-        own_rows = rows[
-            (rows >= self._column_range.start) & (rows < self._column_range.stop)
-        ]
+        begin = self._column_range.start
+        end = self._column_range.stop
+        own_rows = rows[(rows >= begin) & (rows < end)]
         if len(own_rows) == 0:
             return
-        places = own_rows - self._column_range.start
+        places = own_rows - begin
         y = np.ascontiguousarray(start[:, own_rows])
         self._block.replace(places, y, code[own_rows])
         varied = np.ascontiguousarray(self._varied[:, places])
-        joints = np.empty((_GAMMA_DOT.stop, len(own_rows)))
-        self._program((), [*y[STAR], *varied], [*joints])
+        joints = np.empty((_JOINT_ROWS, len(own_rows)))
+        self._compute_joints((), [*y[STAR], *varied], [*joints])
         self._joints[:, places] = joints
 
-    def advance(self, first: int, count: int, h: float, *columns: NDArray[Any]) -> None:
+    def advance(self, first: int, count: int, h: float, columns: Columns) -> None:
         """Advance by some steps under the torques in the columns."""
-        torques = columns[1][TORQUES, self._column_range]
+        torques = columns.drives[TORQUES, self._column_range]
         self._block.given[TORQUES, : torques.shape[1]] = torques
-        self._block.run(self._column_range, first, count, h, *columns)
-        self._block.store(self._column_range, *columns)
-        self._measure[self._block.now]()
+        self._block.run(self._column_range, first, count, h, columns)
+        self._block.store(self._column_range, columns)
+        self._update_joints[self._block.now]()
+
+
+def _spread(values: ArrayLike, number: int) -> Array:
+    """Return three numbers for each robot, shape (number, 3)."""
+    spread = np.empty((number, 3))
+    spread[:] = values
+    return spread
 
 
 def joints_of(batch: Any) -> Any:
-    """Return the program of actuator angles and rates, of seven numbers of a state."""
+    """Compile the angles and rates of the actuators, of the state of the star."""
     model = batch.model
 
     def angles(*inputs: Any) -> Sequence[Any]:

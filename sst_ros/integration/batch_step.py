@@ -9,13 +9,15 @@
 3. What is rare is done for the few columns concerned: which limit was passed first, and
    when. A column that has ended keeps its last valid state; the others continue.
 
-Which limit a step passes first is found from the distances to all: over a step each is
-a cubic in its values and rates at both ends (Hermite). Its error is at most h^4
-max|d^(4)| / 384. A step that ends outside is found, and one that leaves and comes back.
+Which limit a step passes first is found from the distances to all. Over a step each
+distance d is taken as the cubic of its values and rates at both ends (Hermite), whose
+error is at most h^4 max|d^(4)| / 384. A step that ends outside is found, and one that
+leaves and comes back.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -49,7 +51,7 @@ LANE_BLOCK = 192
 takes a hundred times as long as the interpreter between two steps."""
 
 CACHE_LINE = 8
-"""Doubles."""
+"""Doubles in a line of the cache."""
 
 NOT_FINITE_CODE = 1000
 """Code of a scenario whose numbers are no longer finite.
@@ -58,16 +60,45 @@ Others are 1 + the limit's index.
 """
 
 EARLIEST = 1e-8
-"""Least share of a step at which a crossing is reported.
-
-So its time lies in this step.
-"""
+"""Least share of a step at which a crossing is reported: its time lies in this step."""
 
 _NO_SHARE = 2.0
-"""In place of the share of a step at which a limit is passed, where none is."""
+"""Share of a step at which a limit is passed that is not passed in it."""
 
 _EVENT_HALVINGS = 52
-"""Of a step, until the share is known to all digits of a double."""
+"""Halvings of a step until the share is known to all digits of a double."""
+
+REFINED_PARTS = 16
+"""Parts of a step that is repeated to locate an end.
+
+The error of the cubic falls by 16^4.
+"""
+
+Advance = Callable[..., None]
+"""(first, count, step, *columns, rows=None): advances states by `count` steps from step
+`first`, and changes the arrays of `Columns`. `rows` are the scenarios whose last step
+is repeated; None for all.
+"""
+
+
+class Columns(NamedTuple):
+    """Arrays of N scenarios, a column each, that a run changes."""
+
+    y: Array  # states, shape (numbers of a state, N)
+    drives: Array  # drive and varied numbers, shape (numbers, N)
+    code: NDArray[np.int64]  # see `BatchResult.code`; shape (N,), as are the others
+    time: Array  # at which a scenario ended [s]
+    error: Array  # largest local error estimate
+
+    def of_rows(self, rows: NDArray[np.intp]) -> Columns:
+        """Return copies of the columns of some scenarios."""
+        return Columns(
+            np.ascontiguousarray(self.y[:, rows]),
+            np.ascontiguousarray(self.drives[:, rows]),
+            self.code[rows],
+            self.time[rows],
+            self.error[rows],
+        )
 
 
 class Endings(NamedTuple):
@@ -83,10 +114,14 @@ class ColumnStep:
     """The programs of a step of many scenarios, compiled.
 
     Attributes:
-        size: numbers of a state.
-        given: numbers of drive and varied numbers together.
+        size: how many numbers a state has.
+        drive_size: how many a drive has, those that vary included.
+        varied: where in a drive those are.
         limits: number of limits.
         traced: the programs, by name.
+        advance: takes a step.
+        distances: computes the distances to the limits, and their rates.
+        crossing: computes when a limit is passed, see `share_of_crossing`.
 
     """
 
@@ -94,20 +129,19 @@ class ColumnStep:
         self._model = model
         self._method = method
         self.size = len(model.ode.state)
-        self.given = len(model.ode.drive) + len(model.names)
-        self.varied = slice(len(model.ode.drive), self.given)
+        self.drive_size = len(model.ode.drive) + len(model.names)
+        self.varied = slice(len(model.ode.drive), self.drive_size)
         self.limits = len(model.limit_distances.outputs) // 2
         state = [f"y{j}" for j in range(self.size)]
-        distances = [f"was{j}" for j in range(2 * self.limits)]
-        drive_names = [f"g{j}" for j in range(self.given)]
+        distances = [f"d{j}" for j in range(2 * self.limits)]
+        drive = [f"g{j}" for j in range(self.drive_size)]
         shared = ("t", "h")
-        inputs = (*shared, *state, *distances, "error", "running", *drive_names)
+        inputs = (*shared, *state, *distances, "error", "running", *drive)
+        star_inputs = (*shared, *state[STAR], *drive[self.varied])
         ends = (*shared, "before", "rate_before", "after", "rate_after")
         self.traced = {
             "advance": trace(self._advance, inputs),
-            "distances": trace(
-                self._distances, (*shared, *state[STAR], *drive_names[self.varied])
-            ),
+            "distances": trace(self._distances, star_inputs),
             "crossing": trace(share_of_crossing, ends),
         }
         functions = compile_columns(self.traced, len(shared))
@@ -116,40 +150,48 @@ class ColumnStep:
         self.crossing = functions["crossing"]
 
     def _advance(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
-        """Return state, distances and their rates, and largest error after a step.
+        """Return what a step gives.
 
-        And a flag.
-
-        The flag is positive where a limit may have been passed or a number is not
-        finite.
+        That is the new state, the distances to the limits and their rates, the largest
+        error of all steps, and a flag. The flag is positive where a limit may have
+        been passed, or a number is not finite.
         """
-        numbers = iter(inputs)
-        old = [next(numbers) for _ in range(self.size)]
-        was = [next(numbers) for _ in range(2 * self.limits)]
-        error, running, *drive_numbers = numbers
+        distances_end = self.size + 2 * self.limits
+        old = inputs[: self.size]
+        old_distances = inputs[self.size : distances_end]
+        error, running, *drive = inputs[distances_end:]
 
         def derivative(
             time: Scalar, y: Sequence[Scalar], drive: Any
         ) -> tuple[Scalar, ...]:
             return self._model.derivative(time, *y, *drive)
 
-        drives = [drive_numbers] * len(self._method.b)
+        drives = [drive] * len(self._method.b)
         moved, errors = explicit_step(derivative, self._method, t, h, old, drives)
         new = normalise(moved)
-        far = self._model.distances(*new[STAR], *drive_numbers[self.varied])
-        worst = error
-        for state_error in (errors or ())[QUATERNION]:
-            worst = larger(worst, absolute(state_error))
-        flag = larger(may_cross(h, was, far), is_not_finite(reduce(add, new)))
+        distances = self._model.distances(*new[STAR], *drive[self.varied])
+        largest_error = error
+        if errors is not None:
+            for quaternion_error in errors[QUATERNION]:
+                largest_error = larger(largest_error, absolute(quaternion_error))
+        flag = larger(
+            may_cross(h, old_distances, distances), is_not_finite(reduce(add, new))
+        )
         # A scenario that has ended stays where it is.
-        kept = [
+        state = [
             select(running, after, before)
             for before, after in zip(old, new, strict=True)
         ]
-        return (*kept, *far, select(running, worst, error), select(running, flag, 0.0))
+        error = select(running, largest_error, error)
+        return (*state, *distances, error, select(running, flag, 0.0))
 
     def _distances(self, t: Scalar, h: Scalar, *inputs: Scalar) -> tuple[Scalar, ...]:
         return self._model.distances(*inputs)
+
+
+def whole_lanes(count: int) -> int:
+    """Return the least multiple of LANES that is not below a number of columns."""
+    return math.ceil(count / LANES) * LANES
 
 
 def spaced_rows(count: int, width: int) -> Array:
@@ -157,15 +199,18 @@ def spaced_rows(count: int, width: int) -> Array:
 
     Rows that are a power of two apart have the same few places in the cache.
     """
-    lines = -(-width // CACHE_LINE) | 1
+    lines = math.ceil(width / CACHE_LINE)
+    if lines % 2 == 0:
+        lines += 1
     return np.zeros((count, lines * CACHE_LINE))[:, :width]
 
 
 class Block:
     """Columns that are advanced together, in arrays of their own.
 
-    There are two arrays of states, which take turns: a step goes from one to the other,
-    so a step that is not valid can be taken back.
+    There are two arrays, which take turns: a step goes from one to the other, so a step
+    that is not valid can be taken back. Their rows are the numbers of a state, the
+    distances to the limits and their rates, and the largest error.
 
     Attributes:
         running: 1 for a column that goes on, 0 for one that has ended, shape (width,).
@@ -179,11 +224,14 @@ class Block:
         self.width = width
         self._size = step.size
         self._limits = step.limits
-        rows = step.size + 2 * step.limits + 1
+        self._distances = slice(step.size, step.size + 2 * step.limits)  # rows
+        self._error = self._distances.stop  # row
+        rows = self._error + 1
         self._states = spaced_rows(rows, width), spaced_rows(rows, width)
         self._current = 0  # which of the two has the state
-        self.running, self._flag = np.zeros(width), np.zeros(width)
-        self.given = spaced_rows(step.given, width)
+        self.running = np.zeros(width)
+        self._flag = np.zeros(width)
+        self.given = spaced_rows(step.drive_size, width)
         first, second = self._states
         fixed = [self.running, *self.given]
         self._advance = (
@@ -192,7 +240,7 @@ class Block:
         )
         self._measure = step.distances.bind(
             [*first[STAR], *self.given[step.varied]],
-            [*first[step.size : -1]],
+            [*first[self._distances]],
         )
 
     @property
@@ -204,20 +252,20 @@ class Block:
         """States in one of the two arrays, shape (size, width)."""
         return self._states[buffer][: self._size]
 
-    def load(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
-        """Take over columns of states, drives, codes, times and errors.
+    def load(self, columns_of_block: slice, columns: Columns) -> None:
+        """Take over some columns.
 
-        If there are fewer than the block has, the last one is repeated.
+        If there are fewer than the block has, the last one is repeated, and does not
+        run.
         """
-        y, drives, code, _, error = columns
         self._current = 0
         first = self._states[0]
-        fill(first[: self._size], y[:, columns_of_block])
-        fill(first[-1:], error[None, columns_of_block])
-        fill(self.given, drives[: len(self.given), columns_of_block])
-        own = code[columns_of_block]
-        self.running[: len(own)] = own == 0
-        self.running[len(own) :] = 0.0
+        fill(first[: self._size], columns.y[:, columns_of_block])
+        fill(first[self._error :], columns.error[None, columns_of_block])
+        fill(self.given, columns.drives[: len(self.given), columns_of_block])
+        code = columns.code[columns_of_block]
+        self.running[: len(code)] = code == 0
+        self.running[len(code) :] = 0.0
         if self._limits:
             self._measure(0.0, 0.0)
 
@@ -234,20 +282,20 @@ class Block:
         """
         current_rows = self._states[self._current]
         current_rows[: self._size, places] = y
-        current_rows[-1, places] = 0.0
+        current_rows[self._error, places] = 0.0
         self.running[places] = code == 0
         varied = np.ascontiguousarray(self.given[self._step.varied][:, places])
         distances = np.empty((2 * self._limits, len(places)))
         if self._limits:
             self._step.distances((0.0, 0.0), [*y[STAR], *varied], [*distances])
-        current_rows[self._size : -1, places] = distances
+        current_rows[self._distances, places] = distances
 
-    def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
+    def store(self, columns_of_block: slice, columns: Columns) -> None:
         """Put states and errors back."""
-        y, _, code, _, error = columns
-        number = len(code[columns_of_block])
-        y[:, columns_of_block] = self.states(self._current)[:, :number]
-        error[columns_of_block] = self._states[self._current][-1, :number]
+        number = len(columns.code[columns_of_block])
+        current_rows = self._states[self._current]
+        columns.y[:, columns_of_block] = current_rows[: self._size, :number]
+        columns.error[columns_of_block] = current_rows[self._error, :number]
 
     def run(
         self,
@@ -255,7 +303,7 @@ class Block:
         first: int,
         count: int,
         h: float,
-        *columns: NDArray[Any],
+        columns: Columns,
     ) -> None:
         """Advance the columns that were taken over by `count` steps.
 
@@ -263,27 +311,27 @@ class Block:
         end change: to 1 + the index of a limit, or NOT_FINITE_CODE, and to when that
         was [s].
         """
-        _, _, code, time, _ = columns
+        code = columns.code[columns_of_block]
+        time = columns.time[columns_of_block]
         for number in range(first, first + count):
             stop_if_asked()
             self.prepare_step(number)
             self._advance[self._current](number * h, h)
             self._current = 1 - self._current
             if np.count_nonzero(self._flag):
-                self._end_columns(
-                    number, h, code[columns_of_block], time[columns_of_block]
-                )
+                self._end_columns(number, h, code, time)
                 if not self.running.any():
                     return
 
     def prepare_step(self, number: int) -> None:
-        """Do what is to be done before a step: nothing here."""
+        """Do what a subclass has to do before a step."""
 
     def _end_columns(
         self, number: int, h: float, code: NDArray[np.int64], time: Array
     ) -> None:
         """End columns that passed a limit in a step, or are not finite after it."""
-        before, after = self._states[1 - self._current], self._states[self._current]
+        before = self._states[1 - self._current]
+        after = self._states[self._current]
         columns = np.flatnonzero(self._flag > 0.0)
         end_codes, share = self._first_crossings(before, after, h, columns)
         with np.errstate(all="ignore"):
@@ -306,18 +354,15 @@ class Block:
         """
         count = len(columns)
         limits = self._limits
-        size = self._size
         limit_codes = np.zeros(count, dtype=np.int64)
         share = np.ones(count)
-        padded = np.resize(columns, -(-count // LANES) * LANES)
-        ends = [
-            np.ascontiguousarray(states[rows, padded]).ravel()
-            for states in (before[size:, :], after[size:, :])
-            for rows in (
-                np.arange(limits)[:, None],
-                np.arange(limits, 2 * limits)[:, None],
-            )
-        ]
+        # Distances, and rates, of all limits and columns are one row of `crossing`.
+        padded = np.resize(columns, whole_lanes(count))
+        ends = []
+        for states in (before, after):
+            distances_and_rates = states[self._distances][:, padded]
+            for quantity in np.split(distances_and_rates, 2):
+                ends.append(np.ascontiguousarray(quantity).ravel())
         shares = np.full((limits, len(padded)), _NO_SHARE)
         if limits:
             self._step.crossing((0.0, h), ends, [shares.reshape(-1)])
@@ -329,21 +374,25 @@ class Block:
         return limit_codes, share
 
 
-def may_cross(h: Scalar, was: Sequence[Scalar], far: Sequence[Scalar]) -> Scalar:
+def may_cross(h: Scalar, begin: Sequence[Scalar], end: Sequence[Scalar]) -> Scalar:
     """Return a number > 0 if a step of h may pass a limit.
 
-    `was` and `far` are distances and their rates at both ends. It compares the tangents
-    there, which lie below a curve that turns.
+    At the begin and the end are the distances to all limits, then their rates. A
+    distance that falls first and rises then may be negative in between if the tangents
+    of both ends meet below zero, as they lie below a curve that turns.
     """
-    limits = len(was) // 2
-    hit: Scalar = 0.0
+    limits = len(begin) // 2
+    largest: Scalar = 0.0
     for j in range(limits):
-        before, falling = was[j], h * was[limits + j]
-        after, rising = far[j], h * far[limits + j]
-        tangents = before * rising - falling * after + falling * rising
-        dips = select(-falling, select(rising, -tangents, -1.0), -1.0)
-        hit = larger(larger(hit, dips), -GRAZING - after)
-    return hit
+        before = begin[j]
+        after = end[j]
+        falling = h * begin[limits + j]
+        rising = h * end[limits + j]
+        # of the sign of the distance at which the tangents meet, where they do
+        meeting = before * rising - falling * after + falling * rising
+        dips = select(-falling, select(rising, -meeting, -1.0), -1.0)
+        largest = larger(larger(largest, dips), -GRAZING - after)
+    return largest
 
 
 def share_of_crossing(
@@ -356,10 +405,12 @@ def share_of_crossing(
 ) -> tuple[Scalar]:
     """Return the share of a step of h at which a distance becomes negative.
 
-    It is _NO_SHARE where none does. Given are the distance and its rate at both ends,
-    between which it is a cubic.
+    It is _NO_SHARE where it does not. The distance is the cubic of its values and rates
+    at both ends.
     """
-    falling, rising = h * rate_before, h * rate_after
+    falling = h * rate_before
+    rising = h * rate_after
+    # coefficients of the cubic in the share
     square = 3.0 * (after - before) - 2.0 * falling - rising
     cube = falling + rising - 2.0 * (after - before)
     root = sqrt(positive(square * square - 3.0 * cube * falling))
@@ -367,17 +418,18 @@ def share_of_crossing(
     def value(share: Scalar) -> Scalar:
         return before + share * (falling + share * (square + share * cube))
 
-    lowest = select(-falling, select(rising, -falling / (square + root), 1.0), 1.0)
+    # Where it has its least value: at the end, unless it falls first and rises then.
+    turn = -falling / (square + root)
+    lowest = select(-falling, select(rising, turn, 1.0), 1.0)
     high = select(-GRAZING - after, 1.0, lowest)
-    least = value(high)
-    least = select(-after, after, least)
-    end = high
+    least = select(-after, after, value(high))
     low = 0.0
     for _ in range(_EVENT_HALVINGS):
-        middle = 0.5 * (low + end)
+        middle = 0.5 * (low + high)
         outside = -value(middle)
-        low, end = select(outside, low, middle), select(outside, middle, end)
-    return (select(-GRAZING - least, end, _NO_SHARE),)
+        low = select(outside, low, middle)
+        high = select(outside, middle, high)
+    return (select(-GRAZING - least, high, _NO_SHARE),)
 
 
 def is_not_finite(x: Scalar) -> Scalar:
@@ -386,7 +438,7 @@ def is_not_finite(x: Scalar) -> Scalar:
 
 
 def fill(rows: NDArray[Any], values: NDArray[Any]) -> None:
-    """Put values into rows, which may be longer; the last column is repeated."""
+    """Put columns into rows, and repeat the last one where the rows are longer."""
     number = values.shape[1]
     rows[:, :number] = values
     rows[:, number:] = values[:, -1:]
@@ -403,67 +455,53 @@ def advance_blocks(
     """Advance the columns of blocks by `count` steps; see `Block.run`.
 
     Args:
-        block: the blocks are taken over by it in turn.
+        block: takes over the columns of each block in turn.
         begins: the first column of each.
         first: number of the first step.
         count: number of steps.
         h: length of a step [s].
-        columns: states, drives, codes, times and errors, a column a scenario.
+        columns: arrays of `Columns`.
 
     """
+    record = Columns(*columns)
     for begin in begins:
         columns_of_block = slice(begin, begin + block.width)
-        block.load(columns_of_block, *columns)
-        block.run(columns_of_block, first, count, h, *columns)
-        block.store(columns_of_block, *columns)
+        block.load(columns_of_block, record)
+        block.run(columns_of_block, first, count, h, record)
+        block.store(columns_of_block, record)
 
 
-REFINED_PARTS = 16
-"""Parts of a step that is repeated to locate an end.
+def steps_of_ends(times: Array, step: float) -> Array:
+    """Return the numbers of the steps in which scenarios ended at times [s].
 
-The error of a cubic falls 65,536 times.
-"""
-
-Advance = Callable[..., None]
-"""(first, count, step, *arrays, rows=None): advances states by steps from step `first`,
-and changes `arrays`: states, drives, codes, times and errors. `rows` are those whose
-last step is repeated; None for all.
-"""
+    Ends lie behind the begin of a step by EARLIEST of it at least; a tenth of that is
+    left for rounding.
+    """
+    return np.asarray(np.ceil(times / step - 0.1 * EARLIEST) - 1.0)
 
 
-def locate_ends(
-    advance: Advance,
-    step: float,
-    steps: Array,
-    y: Array,
-    drives: Array,
-    code: Any,
-    time: Array,
-) -> None:
+def locate_ends(advance: Advance, step: float, steps: Array, columns: Columns) -> None:
     """Repeat the steps in which limits were passed by finer ones.
 
-    `code` and `time` change.
+    Codes and times change.
+
+    Args:
+        advance: takes steps.
+        step: length of a step [s].
+        steps: number of the step that a scenario ended in.
+        columns: of the scenarios, in their last valid states.
+
     """
+    code = columns.code
     ended = np.flatnonzero((code > 0) & (code < NOT_FINITE_CODE))
     for number in np.unique(steps[ended]):
         rows = ended[steps[ended] == number]
-        refined_codes = np.zeros(len(rows), dtype=np.int64)
-        refined_times = np.full(len(rows), np.nan)
-        arrays = (
-            np.ascontiguousarray(y[:, rows]),
-            np.ascontiguousarray(drives[:, rows]),
-            refined_codes,
-            refined_times,
-        )
+        refined = columns.of_rows(rows)
+        refined.code[:] = 0
+        refined.time[:] = np.nan
+        refined.error[:] = 0.0
         first = int(number) * REFINED_PARTS
-        advance(
-            first,
-            REFINED_PARTS,
-            step / REFINED_PARTS,
-            *arrays,
-            np.zeros(len(rows)),
-            rows=rows,
-        )
-        located = (refined_codes > 0) & (refined_codes < NOT_FINITE_CODE)
-        code[rows[located]] = refined_codes[located]
-        time[rows[located]] = refined_times[located]
+        advance(first, REFINED_PARTS, step / REFINED_PARTS, *refined, rows=rows)
+        located = (refined.code > 0) & (refined.code < NOT_FINITE_CODE)
+        code[rows[located]] = refined.code[located]
+        columns.time[rows[located]] = refined.time[located]

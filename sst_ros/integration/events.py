@@ -35,10 +35,10 @@ _ENTRY = 0.5
 def all_far(
     ranges: JointRanges, begin: Sequence[float], end: Sequence[float], h: float
 ) -> bool:
-    """Test quickly that no limit may have been crossed in h.
+    """Test quickly that no joint can have reached a limit in a step of h [s].
 
-    That is so where a joint is inside before and after, and its rate has not turned, or
-    the joint is farther from the limits than it would come in ten times h.
+    None has where all are inside their range at both ends of the step, and each that
+    has turned is farther from its limits than its rates would take it in ten times h.
     """
     for joint, least, most in ranges:
         if not (least < begin[joint] < most and least <= end[joint] <= most):
@@ -88,11 +88,13 @@ def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
             shrinks = slope(0.0) < 0.0
             # A joint at rest has no slope yet: it counts where it ends outside.
             ends_outside = distance(h) < -GRAZING
-            return 0.0 if is_outside or shrinks or ends_outside else None
+            if is_outside or shrinks or ends_outside:
+                return 0.0
+            return None
         if distance(h) >= 0.0 or (distance(h) >= -GRAZING and not falling):
             return None
-        # It grew first: the crossing lies behind the maximum.
-        begin = _root(slope, 0.0, h) if falling else 0.0
+        if falling:  # it grew first: the crossing lies behind the maximum
+            begin = _root(slope, 0.0, h)
     elif distance(h) >= 0.0:
         if rising or falling:
             return None
@@ -105,7 +107,7 @@ def first_crossing(distance: Signal, slope: Signal, h: float) -> float | None:
 def first_event(
     limits: Iterable[Limit], joints: Joints, h: float
 ) -> tuple[float, Limit] | None:
-    """Return time in [0, h] and limit of the first event, None where there is none."""
+    """Return the time in [0, h] and the limit of the first event, None without one."""
     first: tuple[float, Limit] | None = None
     for limit in limits:
         x = first_crossing(
@@ -123,6 +125,7 @@ def _evaluate(signal: Callable[[Any], float], joints: Joints, x: float) -> float
 
 
 def _root(signal: Signal, begin: float, end: float) -> float:
+    """Return where a signal is zero; `begin` where its sign does not change."""
     if signal(begin) == 0.0 or signal(begin) * signal(end) > 0.0:
         return begin
     from scipy.optimize import brentq  # takes 0.4 s, and many runs have no event
@@ -134,15 +137,16 @@ def largest_passed(
     transitions: Sequence[Transition], begin: Sequence[float], end: Sequence[float]
 ) -> float:
     """Return the largest part of a width that a step passes; above 1 it leaps."""
-    return max(
-        (_passed(transition, begin, end) for transition in transitions), default=0.0
-    )
+    largest = 0.0
+    for transition in transitions:
+        largest = max(largest, _passed(transition, begin, end))
+    return largest
 
 
 def share_before_leap(
     transitions: Sequence[Transition], begin: Sequence[float], end: Sequence[float]
 ) -> float:
-    """Return the share of a step that leaps by which it does not."""
+    """Return the share that a step which leaps is shortened to, so as not to leap."""
     return min(
         _share(transition, begin, end)
         for transition in transitions
@@ -153,9 +157,14 @@ def share_before_leap(
 def _passed(
     transition: Transition, begin: Sequence[float], end: Sequence[float]
 ) -> float:
-    """Return what lies between two rates, over the width that a step may pass."""
+    """Return how much of a transition a step passes, over what it may pass.
+
+    The transition is the range of rates from -edge to +edge; the number is negative
+    where the step stays outside.
+    """
     low, high = sorted((begin[transition.rate], end[transition.rate]))
-    return (min(high, transition.edge) - max(low, -transition.edge)) / transition.width
+    overlap = min(high, transition.edge) - max(low, -transition.edge)
+    return overlap / transition.width
 
 
 def _share(

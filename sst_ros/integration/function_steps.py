@@ -13,20 +13,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
-from sst_ros.dynamics.traced_dynamics import ODE
+from sst_ros.dynamics.traced_dynamics import LEGS, ODE, STATE_SIZE
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.method_steps import (
-    JACOBIAN_COST,
     JOINT_NUMBERS,
-    has_error,
+    STEP_LENGTH,
+    count_step_outputs,
     lagged_torques,
+    pair_outputs,
     read_outcome,
+    step_cost,
     trace_steps,
 )
 from sst_ros.integration.methods import DenseOutput, Method, Rosenbrock, Tableau
@@ -34,13 +36,13 @@ from sst_ros.integration.point import Drive, Outcome, Point, Step
 from sst_ros.integration.steps import (
     Linearisation,
     NewState,
-    add_up,
     compare,
     end_step,
     explicit_step,
     move,
     normalise,
     rosenbrock_step,
+    split,
     step_pair,
 )
 from sst_ros.mechanism.geometry import Array
@@ -58,11 +60,16 @@ Polynomial = Callable[[Array], Array]
 """Times after the begin of a step [s], shape (n,) -> states, shape (n, size)."""
 
 _SHARE_FITTED = 0.4
-"""Of the torques of a step a polynomial goes through so many; the others check it."""
+"""Share of a step's torques that a polynomial goes through; the others check it."""
 _SAME_TORQUE = 1e-13
-"""Relative difference of interpolated torques from the function's, at most. In a step,
-which turns no joint by more than about a radian, it moves no joint by more in radians.
+"""Largest relative difference of interpolated torques from the function's.
+
+A step turns a joint by about a radian at most, so no joint is off by more radians.
 """
+_WORST_OF_QUARTERS = 0.07
+"""Share of a step at which a polynomial through its quarters has the largest error."""
+_WORST_OF_DENSE = 0.83
+"""Share of a step at which the dense output of DOP853 has it."""
 
 
 class FunctionSteps:
@@ -76,13 +83,13 @@ class FunctionSteps:
 
     Attributes:
         method: as given.
-        cost: evaluations of a step; `pair` takes three.
+        cost: evaluations of a step; `pair` takes three steps.
         interpolation_cost: evaluations of `interpolate`.
         worst: share of a step at which the error of that polynomial is largest.
 
     """
 
-    worst = 0.07
+    worst = _WORST_OF_QUARTERS
 
     def __init__(
         self,
@@ -91,8 +98,7 @@ class FunctionSteps:
         torque: AppliedTorque,
         derivative: Callable[..., Sequence[float]] | None = None,
     ) -> None:
-        implicit = isinstance(method, Rosenbrock)
-        if derivative is not None and implicit:
+        if derivative is not None and isinstance(method, Rosenbrock):
             raise ValueError(
                 "a derivative of its own has no Jacobian, which the method needs"
             )
@@ -100,7 +106,8 @@ class FunctionSteps:
         self._ode = ode
         self._torque = torque
         self._derivative = derivative
-        self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
+        self.cost = step_cost(method)
+        # steps to the three inner quarters, and slopes at five points
         self.interpolation_cost = 3 * self.cost + 5
         self._size = len(ode.state)
 
@@ -124,7 +131,9 @@ class FunctionSteps:
         second_drive: Drive | None = None,
     ) -> Outcome:
         """See `MethodSteps.pair`."""
-        drives = (drive, second_drive or drive, second_drive or drive)
+        if second_drive is None:
+            second_drive = drive
+        drives = (drive, second_drive, second_drive)
 
         def step(
             number: int, t: float, h: float, y: Sequence[float], linearised_at: Any
@@ -133,9 +142,7 @@ class FunctionSteps:
 
         pair = step_pair(step, t, h, point.y, point.z, lagged_torques(self._ode))
         joints = self._ode.dynamics.joints(*pair.y[STAR])
-        total = pair.total + add_up(joints)
-        numbers = [*pair.y, *pair.z, *joints, pair.size, total]
-        return read_outcome(numbers, point, self._size)
+        return read_outcome(pair_outputs(pair, joints), point, self._size)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -163,7 +170,8 @@ class FunctionSteps:
         from scipy.interpolate import KroghInterpolator  # many runs have few samples
 
         times = [0.25 * k * step.h for k in range(5)]
-        states = [step.begin.y, *(step.inside(x) for x in times[1:-1]), step.end.y]
+        inner_states = map(step.inside, times[1:-1])
+        states = [step.begin.y, *inner_states, step.end.y]
         data: list[Sequence[float]] = []
         for x, y in zip(times, states, strict=True):
             data += [y, self.slope(step.t + x, y, step.drive)]
@@ -188,19 +196,19 @@ class FunctionSteps:
         return rosenbrock_step(self.slope, linearisation, method, t, h, y, drive)
 
     def _linearise(self, t: float, y: Sequence[float], drive: Drive) -> Linearisation:
-        """Linearise: exact by the state, by differences of the torque."""
+        """Linearise: exactly the motion, and by differences the function's torques."""
         size = self._size
         torque = self._torque.of_drive(drive, t, y)
         moment = drive.numbers[MOMENT]
         numbers = self._ode.linearised_by_torque(t, *y, *torque, *moment)
-        rows = np.array(numbers).reshape(size + 5, size)
-        slope = rows[0]
-        by_time = rows[1]
-        by_state, by_torque = rows[2 : size + 2], rows[size + 2 :]
+        rows = np.array(numbers).reshape(-1, size)
+        slope, by_time_alone, *_ = rows
+        by_torque = rows[-LEGS:]
+        by_state = rows[-LEGS - size : -LEGS]
         rate = self._torque.rate(drive, t, y, torque)
         feedback = self._torque.by_state(drive, t, y, torque)
         columns = by_state + feedback.T @ by_torque
-        by_time = by_time + rate @ by_torque
+        by_time = by_time_alone + rate @ by_torque
         return Linearisation(slope.tolist(), by_time.tolist(), columns.tolist())
 
 
@@ -260,12 +268,12 @@ class TimeSteps(FunctionSteps):
         """See `MethodSteps.states_inside`."""
         rows = [(step.t, 0.0, *step.begin.y) for step in steps]
         begins = np.array(rows).repeat(counts, axis=0)
-        begins[:, 1] = x
+        begins[:, STEP_LENGTH] = x
         torques = self._torques_inside(steps, counts, x)
+        # A moment is the same in all stages of a step.
         moments = np.array([step.drive.numbers[MOMENT] for step in steps])
         moments = moments.repeat(counts, axis=0)[:, None, :]
-        stages = (len(x), len(self.method.c))
-        moments = np.broadcast_to(moments, (*stages, moments.shape[2]))
+        moments = moments.repeat(len(self.method.c), axis=1)
         drives = np.concatenate([torques, moments], axis=2).reshape(len(x), -1)
         single = compile_rows_by_stage(self._ode, self.method)
         return single(np.hstack([begins, drives]))
@@ -277,13 +285,13 @@ class TimeSteps(FunctionSteps):
     def _torques_at(self, times: Sequence[float], drive: Drive) -> list[Any]:
         """Return the torques at times of the steps [s].
 
-        Equal ones are asked for once.
+        The function is called once for times that are equal.
         """
         assert drive.function is not None
-        different = list(dict.fromkeys(times))
-        absolute = [drive.start + time for time in different]
-        torques = self._torque.at_times(drive.function, absolute)
-        torque_by_time = dict(zip(different, torques, strict=True))
+        distinct_times = list(dict.fromkeys(times))
+        times_of_run = [drive.start + time for time in distinct_times]
+        torques = self._torque.at_times(drive.function, times_of_run)
+        torque_by_time = dict(zip(distinct_times, torques, strict=True))
         return [torque_by_time[time] for time in times]
 
     @staticmethod
@@ -299,13 +307,17 @@ class TimeSteps(FunctionSteps):
     def _torques_inside(
         self, steps: Sequence[Step], counts: Sequence[int], x: Array
     ) -> Array:
-        """Return torques in the stages of steps to times inside, shape (n, s, 3)."""
+        """Return torques in the stages of shorter steps to times inside of steps.
+
+        They are those of a polynomial in the steps whose torques follow one, and those
+        that the function gives in the others. The shape is (n, stages, 3).
+        """
         fit = fit_of(self.method)
         stage_torques = np.array([step.stages for step in steps])
         coefficients = fit.solution @ stage_torques[:, fit.fitted]
-        off = np.abs(fit.values @ coefficients - stage_torques[:, fit.checked])
+        misfits = np.abs(fit.values @ coefficients - stage_torques[:, fit.checked])
         largest = np.abs(stage_torques).max(axis=(1, 2))
-        is_smooth = off.max(axis=(1, 2)) <= _SAME_TORQUE * largest
+        is_smooth = misfits.max(axis=(1, 2)) <= _SAME_TORQUE * largest
         lengths = np.array([step.h for step in steps]).repeat(counts)
         shares = np.multiply.outer(x / lengths, self.method.c)
         basis = _basis(shares, fit.solution.shape[0])
@@ -333,13 +345,13 @@ def compile_rows_by_stage(ode: ODE, method: Tableau) -> RowsFunction:
 
 
 def _trace_by_stage(ode: ODE, method: Tableau) -> dict[str, Program]:
-    size = len(ode.state)
-    drive = len(ode.drive)
-    lagged = lagged_torques(ode)
+    steps = trace_steps(
+        method, len(ode.state), len(ode.drive), lagged_torques(ode), by_stage=True
+    )
     return {
         "slope": ode.program,
         "joints": ode.dynamics.joints_program,
-        **trace_steps(method, size, drive, lagged, by_stage=True),
+        **steps,
     }
 
 
@@ -357,24 +369,25 @@ class Fit(NamedTuple):
 
 @lru_cache(maxsize=8)
 def fit_of(method: Tableau) -> Fit:
-    """Choose the stages nearest to the zeros of Chebyshev's polynomials."""
+    """Fit a polynomial to the stages nearest to the zeros of one of Chebyshev's."""
     nodes = np.array(method.c)
+    # of the step of the first solution, and of both steps of the second
     shares = np.concatenate([nodes, 0.5 * nodes, 0.5 + 0.5 * nodes])
-    _, first = np.unique(shares, return_index=True)
-    left = first.tolist()
-    size = max(2, round(_SHARE_FITTED * len(left)))
+    _, distinct = np.unique(shares, return_index=True)
+    unused = distinct.tolist()
+    size = max(2, round(_SHARE_FITTED * len(unused)))
     fitted = []
     for k in range(size):
-        target = 0.5 - 0.5 * np.cos(np.pi * (k + 0.5) / size)
-        nearest = min(left, key=lambda stage: abs(shares[stage] - target))
+        zero = 0.5 - 0.5 * np.cos(np.pi * (k + 0.5) / size)
+        nearest = unused[int(np.abs(shares[unused] - zero).argmin())]
         fitted.append(nearest)
-        left.remove(nearest)
+        unused.remove(nearest)
     solution = np.asarray(np.linalg.inv(_basis(shares[fitted], size)), dtype=float)
-    return Fit(fitted, left, solution, _basis(shares[left], size))
+    return Fit(fitted, unused, solution, _basis(shares[unused], size))
 
 
 def _basis(shares: Array, size: int) -> Array:
-    """Return the terms of a polynomial at shares of a step, shape (..., size)."""
+    """Return Chebyshev's polynomials at shares of a step, shape (..., size)."""
     return np.asarray(chebvander(2.0 * shares - 1.0, size - 1))
 
 
@@ -424,10 +437,12 @@ class FeedbackSteps(FunctionSteps):
         joints = self._functions["joints"]
         half = 0.5 * h
         z = point.z
-        slopes, y_end = self._go(t, h, point.y, point.joints, drive)
-        _, middle = self._go(t, half, z, joints(*z[STAR]), second_drive)
-        middle = middle[: self._size]
-        _, z_end = self._go(t + half, half, middle, joints(*middle[STAR]), second_drive)
+        slopes, y_end = self._take_stages(t, h, point.y, point.joints, drive)
+        _, middle_end = self._take_stages(t, half, z, joints(*z[STAR]), second_drive)
+        middle = middle_end[: self._size]
+        _, z_end = self._take_stages(
+            t + half, half, middle, joints(*middle[STAR]), second_drive
+        )
         numbers = self._functions["end"](h, *point.y, *z, *y_end, *z_end)
         return read_outcome(numbers, point, self._size, slopes)
 
@@ -440,10 +455,10 @@ class FeedbackSteps(FunctionSteps):
         drive: Drive,
     ) -> NewState:
         joints = self._functions["joints"](*y[STAR])
-        _, numbers = self._go(t, h, y, joints, drive)
+        _, numbers = self._take_stages(t, h, y, joints, drive)
         return NewState(numbers[: self._size], None)
 
-    def _go(
+    def _take_stages(
         self,
         t: float,
         h: float,
@@ -451,8 +466,9 @@ class FeedbackSteps(FunctionSteps):
         joints: Sequence[float],
         drive: Drive,
     ) -> tuple[list[float], list[float]]:
-        """Take a step: return the slopes in its stages, the new state and its error.
+        """Take a step: return the slopes in its stages, and where it ends.
 
+        The latter is the new state, and its error where the method estimates it.
         `joints` are those of y.
         """
         size = self._size
@@ -474,7 +490,10 @@ class FeedbackSteps(FunctionSteps):
         return slopes, numbers[size:]
 
     def interpolate(self, step: Step) -> Polynomial | None:
-        """Return the states inside a step by the dense output, if there is one."""
+        """Return the states inside a step by the dense output, if there is one.
+
+        Terms are F_0, F_1, ... of `DenseOutput`.
+        """
         dense = self.method.dense
         if dense is None:
             return super().interpolate(step)
@@ -500,7 +519,8 @@ class FeedbackSteps(FunctionSteps):
             share = np.reshape(x, (-1, 1)) / h
             total = np.zeros((len(share), size))
             for number in reversed(range(len(terms))):
-                factor = 1.0 - share if number % 2 else share
+                is_odd = number % 2 == 1
+                factor = 1.0 - share if is_odd else share
                 total = factor * (terms[number] + total)
             return np.asarray(begin + total)
 
@@ -513,17 +533,10 @@ def _arrays_of_dense(dense: DenseOutput) -> tuple[list[Array], Array]:
     return [np.array(weights) for weights in dense.a], np.array(dense.weights)
 
 
-_WORST_OF_DENSE = 0.83
-"""Share of a step at which the error of DOP853's dense output is largest."""
-
-
 @lru_cache(maxsize=64)
 def compile_stages(ode: ODE, method: Tableau) -> dict[str, Function]:
     """Compile the programs of `trace_stages`, and `joints`."""
-    size = len(ode.state)
-    drive = len(ode.drive)
-    lagged = lagged_torques(ode)
-    stages = trace_stages(method, size, drive, lagged)
+    stages = trace_stages(method, len(ode.state), len(ode.drive), lagged_torques(ode))
     programs = {
         "slope": ode.program,
         "joints": ode.dynamics.joints_program,
@@ -546,44 +559,35 @@ def trace_stages(
     `trace_steps`.
     """
     slope = Routine("slope", 1 + size + drive, size)
-    joints = Routine("joints", 7, JOINT_NUMBERS)
+    joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
     stages = len(method.a)
+    end_size = count_step_outputs(method, size)
 
     def take_stage(number: int, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
-        y = inputs[:size]
-        stage_inputs = inputs[size:]
-        slopes = [stage_inputs[size * k : size * (k + 1)] for k in range(number)]
-        point = stage_inputs[size * number : size * (number + 1)]
-        slopes.append(slope(t, *point, *stage_inputs[size * (number + 1) :]))
+        # Vectors as long as the state: itself, the slopes, and the point.
+        vectors_end = (2 + number) * size
+        y, *earlier_slopes, point = split(inputs[:vectors_end], size)
+        own_slope = slope(t, *point, *inputs[vectors_end:])
+        slopes = [*earlier_slopes, own_slope]
         if number == stages - 1:
-            new = end_step(method, h, y, slopes)
-            return (*slopes[-1], *new.state, *(new.error or ()))
-        following = move(y, h, method.a[number + 1], slopes)
-        return (*slopes[-1], *following, *joints(*following[STAR]))
+            return (*own_slope, *end_step(method, h, y, slopes).numbers())
+        next_point = move(y, h, method.a[number + 1], slopes)
+        return (*own_slope, *next_point, *joints(*next_point[STAR]))
 
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
         y = inputs[:size]
         z = inputs[size : 2 * size]
-        step_ends = inputs[2 * size :]
-        half = len(step_ends) // 2
-        first, second = (
-            NewState([*end[:size]], [*end[size:]] or None)
-            for end in (step_ends[:half], step_ends[half:])
-        )
+        y_end, z_end = split(inputs[2 * size :], end_size)
+        first = NewState.of(y_end, size)
+        second = NewState.of(z_end, size)
         pair = compare(h, y, z, first, second, lagged)
-        angles = joints(*pair.y[STAR])
-        total = pair.total + add_up(angles)
-        return (*pair.y, *pair.z, *angles, pair.size, total)
+        return pair_outputs(pair, joints(*pair.y[STAR]))
 
     programs = {}
     for number in range(stages):
         count = 2 + (2 + number) * size + drive
         names = [f"i{k}" for k in range(count)]
-
-        def take_numbered(*inputs: Any, number: int = number) -> tuple[Any, ...]:
-            return take_stage(number, *inputs)
-
-        programs[f"stage{number}"] = trace(take_numbered, names)
-    count = 1 + (2 + 2 * (2 if has_error(method) else 1)) * size
+        programs[f"stage{number}"] = trace(partial(take_stage, number), names)
+    count = 1 + 2 * size + 2 * end_size
     programs["end"] = trace(end_pair, [f"i{k}" for k in range(count)])
     return programs

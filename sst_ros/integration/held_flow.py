@@ -27,27 +27,31 @@ from sst_ros.mechanism.generic_math import absolute, larger
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.compiled import RowsFunction, compile_rows
 from sst_ros.programs.expression import Routine, trace
-from sst_ros.state import Vector3
+from sst_ros.state import TORQUES, Vector3
 
 _TOLERANCE = 1e-12
 """Largest error of a step, relative to numbers above 1."""
-_AT_STOPS = 0.1
-"""Share of it where stops are elastic.
+_SHARE_AT_STOPS = 0.1
+"""Share of the tolerance where stops are elastic.
 
 A step across a jump of derivatives loses its order.
 """
 _SHORTEST = 1e-16
 """Share of the period below which no step resolves the motion."""
 
+# Columns of the outputs of a step, see `_compile_step`
+_ERROR = -2
+_TOTAL = -1
+
 
 class HeldFlow(NamedTuple):
-    """Where a motion under held torques goes.
+    """A motion under held torques, and the derivatives of its end.
 
     Attributes:
-        times: of the begin and of the ends of steps [s], shape (n,).
+        times: at the begin and at the ends of steps [s], shape (n,).
         states: at these times, shape (n, m).
         by_start: derivatives of the last state by the first, shape (m, m).
-        by_torque: those by the torques, shape (m, 3).
+        by_torque: derivatives of the last state by the torques, shape (m, 3).
 
     """
 
@@ -73,24 +77,23 @@ def follow_held_torque(
         y: state at the begin, m numbers.
         torque: what acts [N m].
         length: of the period [s].
-        most: evaluations.
+        most: evaluations that it may take.
         elastic: whether stops are elastic.
 
     Returns:
-        None where the motion does not last, or takes more evaluations.
+        None where no step resolves the motion, or it takes more evaluations.
 
     """
     size = len(y)
     step = _compile_step(ode)
-    columns = size + LEGS  # of S: by the state at the begin, then by the torques
-    rows = _rows_of_motion(ode, columns, torque)
-    moving = rows[:, 1 : 1 + 2 * size]  # the motion, and a column of S
-    moving[:, :size] = y
-    moving[:size, size:] = np.eye(size)
-    rows[size:, -LEGS:] = np.eye(LEGS)
-    tolerance = _TOLERANCE * (_AT_STOPS if elastic else 1.0)
+    # A row has the motion and a column of S: by the start, then by the torques.
+    inputs = _StepInputs(ode, size + LEGS, torque)
+    inputs.states[:] = y
+    inputs.columns[:size] = np.eye(size)
+    inputs.torque_rates[size:] = np.eye(LEGS)
+    tolerance = _TOLERANCE * _SHARE_AT_STOPS if elastic else _TOLERANCE
     times = [0.0]
-    states = [moving[0, :size].copy()]
+    states = [np.array(y, dtype=float)]
     t = 0.0
     h = length
     evaluations = 0
@@ -99,27 +102,29 @@ def follow_held_torque(
         evaluations += len(DOP853.c)
         if evaluations > most or h < _SHORTEST * length:
             return None
-        rows[:, 0] = h
-        results = step(rows)
-        if not np.isfinite(results[:, -1]).all():
+        inputs.lengths[:] = h
+        results = step(inputs.rows)
+        if not np.isfinite(results[:, _TOTAL]).all():
             h *= LARGEST_SHRINKAGE
             continue
-        error = float(results[:, -2].max()) / tolerance
+        error = float(results[:, _ERROR].max()) / tolerance
         if error <= 1.0:
-            t = length if h == length - t else t + h
-            moving[:] = results[:, : 2 * size]
+            is_last = h == length - t
+            t = length if is_last else t + h
+            inputs.states[:] = results[:, :size]
+            inputs.columns[:] = results[:, size : 2 * size]
             times.append(t)
-            states.append(moving[0, :size].copy())
+            states.append(results[0, :size].copy())
         h *= step_factor(error, DOP853)
-    by_number = moving[:, size:].T
-    by_start, by_torque = by_number[:, :size], by_number[:, size:]
+    by_start = inputs.columns[:size].T
+    by_torque = inputs.columns[size:].T
     return HeldFlow(np.array(times), np.array(states), by_start, by_torque)
 
 
 def states_inside(ode: ODE, flow: HeldFlow, torque: Vector3, times: Array) -> Array:
     """Return the states of a motion at times inside its period.
 
-    Each is reached by a shorter step from the begin of the step that it lies in.
+    Each is the end of a shorter step from the begin of the step around it.
 
     Args:
         ode: as for `follow_held_torque`.
@@ -132,20 +137,35 @@ def states_inside(ode: ODE, flow: HeldFlow, torque: Vector3, times: Array) -> Ar
 
     """
     begins = np.searchsorted(flow.times, times, side="right") - 1
-    size = flow.states.shape[1]
-    rows = _rows_of_motion(ode, len(times), torque)
-    rows[:, 0] = times - flow.times[begins]
-    rows[:, 1 : 1 + size] = flow.states[begins]
-    return _compile_step(ode)(rows)[:, :size]
+    inputs = _StepInputs(ode, len(times), torque)
+    inputs.lengths[:] = times - flow.times[begins]
+    inputs.states[:] = flow.states[begins]
+    return _compile_step(ode)(inputs.rows)[:, : len(ode.state)]
 
 
-def _rows_of_motion(ode: ODE, count: int, torque: Vector3) -> Array:
-    """Return rows of inputs of a step: those of the drive, and zeros."""
-    size = len(ode.state)
-    rows = np.zeros((count, 1 + 2 * size + len(ode.drive) + LEGS))
-    first = 1 + 2 * size
-    rows[:, first : first + LEGS] = torque
-    return rows
+class _StepInputs:
+    """Rows of inputs of `_compile_step`, of n steps under held torques.
+
+    All but the torques are zero at first.
+
+    Attributes:
+        rows: all inputs, shape (n, inputs), of which the others are views.
+        lengths: of the steps [s], shape (n,).
+        states: at the begins, shape (n, m).
+        columns: of the derivatives, shape (n, m).
+        torque_rates: rates at which torques change along the column, shape (n, 3).
+
+    """
+
+    def __init__(self, ode: ODE, count: int, torque: Vector3) -> None:
+        size = len(ode.state)
+        widths = [1, size, size, len(ode.drive), LEGS]
+        self.rows = np.zeros((count, sum(widths)))
+        lengths, self.states, self.columns, drives, self.torque_rates = np.split(
+            self.rows, np.cumsum(widths[:-1]), axis=1
+        )
+        self.lengths = lengths[:, 0]
+        drives[:, TORQUES] = torque
 
 
 @lru_cache(maxsize=32)
@@ -154,7 +174,7 @@ def _compile_step(ode: ODE) -> RowsFunction:
 
     Its inputs are the length of the step, the state, the column, the drive, and the
     rates at which the torques change along the column. Its outputs are the new state
-    and column, their largest error relative to numbers above 1, and a total that is
+    and column, their largest error, relative to numbers above 1, and a total that is
     finite where all numbers are.
     """
     size = len(ode.state)
@@ -164,7 +184,8 @@ def _compile_step(ode: ODE) -> RowsFunction:
     def differentiate(
         time: Any, point: Sequence[Any], drive_and_rates: Sequence[Any]
     ) -> Sequence[Any]:
-        state, column = point[:size], point[size:]
+        state = point[:size]
+        column = point[size:]
         drive = drive_and_rates[:drive_size]
         torque_rates = drive_and_rates[drive_size:]
         return tangent(time, *state, *drive, *column, *torque_rates)
@@ -172,9 +193,9 @@ def _compile_step(ode: ODE) -> RowsFunction:
     def take_step(h: Any, *numbers: Any) -> list[Any]:
         before = numbers[: 2 * size]
         drive_and_rates = numbers[2 * size :]
-        each = [drive_and_rates] * len(DOP853.a)
+        drives = [drive_and_rates] * len(DOP853.a)
         # held torques: the motion does not depend on the time
-        after, errors = explicit_step(differentiate, DOP853, 0.0, h, before, each)
+        after, errors = explicit_step(differentiate, DOP853, 0.0, h, before, drives)
         assert errors is not None
         largest: Any = 0.0
         for old, new, error in zip(before, after, errors, strict=True):

@@ -24,9 +24,7 @@ def run_many(
     workers: int = 1,
     label: str = "",
 ) -> Iterator[tuple[int, Result]]:
-    """Call a function for each job.
-
-    Yield the number of the job and the result when it is done.
+    """Call a function for each job; yield the job's number and result when it is done.
 
     Args:
         function: what is called; an exception that it raises ends all jobs.
@@ -49,9 +47,11 @@ def _on_threads(
     function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
 ) -> Iterator[tuple[int, Result]]:
     stop = threading.Event()
-    pool = ThreadPoolExecutor(
-        workers, initializer=setattr, initargs=(_OWN, "stop", stop)
-    )
+
+    def begin_thread() -> None:
+        _OWN.stop = stop
+
+    pool = ThreadPoolExecutor(workers, initializer=begin_thread)
     futures = {pool.submit(function, job): number for number, job in enumerate(jobs)}
     try:
         for future in as_completed(futures):
@@ -68,8 +68,8 @@ class Stopped(BaseException):
 def stop_if_asked() -> None:
     """Raise Stopped in a thread of `run_many` whose results are no longer wanted.
 
-    So an interrupt of the main thread, or an error, ends long jobs at once. Elsewhere
-    it does nothing.
+    In other threads it does nothing. Long jobs call it now and then, so that an
+    interrupt of the main thread, or an error in another job, ends them at once.
     """
     stop = getattr(_OWN, "stop", None)
     if stop is not None and stop.is_set():

@@ -22,10 +22,12 @@ from sst_ros.integration.point import Drive, Outcome, Point, Step
 from sst_ros.integration.steps import (
     Linearisation,
     NewState,
+    Pair,
     add_up,
     explicit_step,
     normalise,
     rosenbrock_step,
+    split,
     step_pair,
 )
 from sst_ros.mechanism.geometry import Array
@@ -36,13 +38,16 @@ from sst_ros.programs.compiled import (
 )
 from sst_ros.programs.expression import Program, Routine, trace
 from sst_ros.programs.llvm import Function
-from sst_ros.state import STAR, cached_property
+from sst_ros.state import JOINT_COUNT, STAR, cached_property
 
 JACOBIAN_COST = 30
 """Measured cost of a Jacobian with factorisation, in evaluations of plain Python."""
 
-JOINT_NUMBERS = 18
-"""Numbers of `joints`: nine angles and nine rates."""
+JOINT_NUMBERS = 2 * JOINT_COUNT
+"""Numbers of `joints`: the angles and their rates."""
+
+STEP_LENGTH = 1
+"""Place of the length of a step among the inputs of `single`."""
 
 LARGEST_GROWTH = 5.0
 """Factor by which a step grows at most: one small estimate may be chance."""
@@ -53,7 +58,7 @@ SAFETY = 0.9
 
 
 class MethodSteps:
-    """Steps of an ODE under torques that are numbers, a sine, or a function of time.
+    """Steps of an ODE under torques that are numbers or a sine.
 
     Args:
         ode: what is integrated; its drive is the numbers of a `Drive`.
@@ -61,15 +66,14 @@ class MethodSteps:
 
     Attributes:
         method: as given.
-        cost: evaluations of a step; `pair` takes three.
+        cost: evaluations of a step; `pair` takes three steps.
 
     """
 
     def __init__(self, ode: ODE, method: Method) -> None:
         self.method = method
         self._ode = ode
-        implicit = isinstance(method, Rosenbrock)
-        self.cost = len(method.a) + (JACOBIAN_COST if implicit else 0)
+        self.cost = step_cost(method)
         self._size = len(ode.state)
 
     @cached_property
@@ -109,8 +113,8 @@ class MethodSteps:
         """Advance both solutions of a point by h: by one step, and by two of h / 2.
 
         The second one has the drive `second_drive`, by default that of the first.
-        Returns where they end, and the local error estimate in units of the tolerance;
-        infinite where a number of the step is not finite.
+        Returns where they end, and the local error estimate, which is infinite where a
+        number of the step is not finite.
         """
         if second_drive is None:
             second_drive = drive
@@ -124,7 +128,7 @@ class MethodSteps:
     ) -> list[float]:
         """Advance a state alone by h; its error is not looked at.
 
-        Where it has no value: nan.
+        Its numbers are nan where the step has no finite result.
         """
         return self._functions["single"](t, h, *y, *drive.numbers)
 
@@ -140,7 +144,7 @@ class MethodSteps:
         return state
 
     def states_after(self, rows: Array) -> Array:
-        """Return what `single` gives for rows of t, h, state and drive, (n, size)."""
+        """Return what `single` does for rows of t, h, state and drive, (n, size)."""
         return self._single_of_rows(rows)
 
     def states_inside(
@@ -151,12 +155,13 @@ class MethodSteps:
         Args:
             steps: those of this method in a run.
             counts: how many states are asked for in each.
-            x: their times after the begin of their step [s], shape (n,).
+            x: their times after the begin of their step [s], shape (n,): the lengths of
+                the shorter steps.
 
         """
         rows = [(step.t, 0.0, *step.begin.y, *step.drive.numbers) for step in steps]
         inputs = np.array(rows).repeat(counts, axis=0)
-        inputs[:, 1] = x
+        inputs[:, STEP_LENGTH] = x
         return self.states_after(inputs)
 
     def slope(self, t: float, y: Sequence[float], drive: Drive) -> list[float]:
@@ -203,8 +208,9 @@ def trace_steps(
     second_state = [f"z{i}" for i in range(size)]
     point = [f"near{i}" for i in range(tracer.point_size)]
     drives = [f"d{i}" for i in range(tracer.drive_size)]
-    # Under a function of the time both steps of the second solution have their own.
-    second_count = tracer.drive_size * (2 if by_stage else 1)
+    second_count = tracer.drive_size
+    if by_stage:  # both steps of the second solution have drives of their own
+        second_count = 2 * second_count
     second_drives = [f"e{i}" for i in range(second_count)]
     pair_inputs = ("t", "h", *state, *second_state, *drives, *second_drives)
     return {
@@ -215,7 +221,7 @@ def trace_steps(
 
 
 class _StepTracer:
-    """The programs of `trace_steps` as functions of numbers, with its arguments.
+    """The functions that `trace_steps` traces; it takes the same arguments.
 
     Attributes:
         point_size: numbers of the state at which a step linearises; none if explicit.
@@ -230,37 +236,31 @@ class _StepTracer:
         self._size = size
         self._drive = drive
         self._lagged = lagged
-        self._stages = len(method.a) if by_stage else 1
+        self._by_stage = by_stage
         self.point_size = size if isinstance(method, Rosenbrock) else 0
-        self.drive_size = self._stages * drive
+        self.drive_size = drive * len(method.a) if by_stage else drive
         self._slope = Routine("slope", 1 + size + drive, size)
         self._joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
         step_inputs = 2 + size + self.point_size + self.drive_size
-        self._step = Routine(
-            "step", step_inputs, size * (2 if has_error(method) else 1)
-        )
+        self._step = Routine("step", step_inputs, count_step_outputs(method, size))
 
-    def take_step(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
+    def take_step(self, t: Any, h: Any, *inputs: Any) -> list[Any]:
         """Return the new state, and its error where the method estimates it."""
         size = self._size
         method = self._method
+        derivative = self._derivative
         y = inputs[:size]
         point = inputs[size : size + self.point_size]
-        numbers = inputs[size + self.point_size :]
+        drive = inputs[size + self.point_size :]
         if isinstance(method, Rosenbrock):
-            linearisation = self._linearise(t, point, numbers)
-            new = rosenbrock_step(
-                self._derivative, linearisation, method, t, h, y, numbers
-            )
+            linearisation = self._linearise(t, point, drive)
+            new = rosenbrock_step(derivative, linearisation, method, t, h, y, drive)
         else:
-            drives = [
-                numbers[self._drive * k : self._drive * (k + 1)]
-                for k in range(self._stages)
-            ]
-            if self._stages == 1:
-                drives = drives * len(method.a)
-            new = explicit_step(self._derivative, method, t, h, y, drives)
-        return (*new.state, *(new.error or ()))
+            drives: list[Any] = [drive] * len(method.a)
+            if self._by_stage:
+                drives = split(drive, self._drive)
+            new = explicit_step(derivative, method, t, h, y, drives)
+        return new.numbers()
 
     def take_pair(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return what both solutions have become, and the size of the error."""
@@ -281,18 +281,17 @@ class _StepTracer:
         ) -> NewState:
             point = linearised_at[: self.point_size]
             results = self._step(t, h, *y, *point, *drives_of_steps[number])
-            return NewState([*results[:size]], [*results[size:]] or None)
+            return NewState.of(results, size)
 
         pair = step_pair(call, t, h, y, z, self._lagged)
-        angles = self._joints(*pair.y[STAR])
-        total = pair.total + add_up(angles)
-        return (*pair.y, *pair.z, *angles, pair.size, total)
+        return pair_outputs(pair, self._joints(*pair.y[STAR]))
 
     def take_single(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the new state."""
         size = self._size
         y = inputs[:size]
-        results = self._step(t, h, *y, *y[: self.point_size], *inputs[size:])
+        point = y[: self.point_size]
+        results = self._step(t, h, *y, *point, *inputs[size:])
         return tuple(normalise(results[:size]))
 
     def _derivative(
@@ -304,29 +303,42 @@ class _StepTracer:
         self, t: Any, y: Sequence[Any], numbers: Sequence[Any]
     ) -> Linearisation:
         size = self._size
-        inputs = 1 + size + self._drive
-        results = Routine("linearise", inputs, (size + 2) * size)(t, *y, *numbers)
-        rows = [results[size * k : size * (k + 1)] for k in range(size + 2)]
-        slope, by_time, *columns = rows
+        linearise = Routine("linearise", 1 + size + self._drive, (size + 2) * size)
+        slope, by_time, *columns = split(linearise(t, *y, *numbers), size)
         return Linearisation(slope, by_time, columns)
 
 
-def has_error(method: Method) -> bool:
-    """Return whether a method estimates the error of its steps."""
-    return isinstance(method, Rosenbrock) or bool(method.error)
+def step_cost(method: Method) -> int:
+    """Return the evaluations of a step, its Jacobian included."""
+    stages = len(method.a)
+    return stages + JACOBIAN_COST if isinstance(method, Rosenbrock) else stages
+
+
+def count_step_outputs(method: Method, size: int) -> int:
+    """Return how many numbers a step gives: the state, and its error if estimated."""
+    estimates_error = isinstance(method, Rosenbrock) or bool(method.error)
+    return 2 * size if estimates_error else size
 
 
 def lagged_torques(ode: ODE) -> int:
-    """Numbers of the state that are lagging torques."""
-    return 3 if set(LAG) <= set(ode.state) else 0
+    """Return how many numbers of the state are torques that lag."""
+    return len(LAG) if set(LAG) <= set(ode.state) else 0
+
+
+def pair_outputs(pair: Pair, joints: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the outputs of `pair`: those of `step_pair`, and the joints of the first.
+
+    The last is a total that is finite where all numbers are.
+    """
+    total = pair.total + add_up(joints)
+    return (*pair.y, *pair.z, *joints, pair.size, total)
 
 
 def read_outcome(
     numbers: Sequence[float], point: Point, size: int, stages: Sequence[Any] = ()
 ) -> Outcome:
-    """Read the outputs of `pair`."""
-    *_, error, total = numbers
-    finite = total - total == 0.0
+    """Read the outputs of `pair`, see `pair_outputs`."""
+    error, total = numbers[-2:]
     after = Point(  # a call of `_replace` takes three times as long
         [*numbers[:size]],
         [*numbers[size : 2 * size]],
@@ -337,14 +349,14 @@ def read_outcome(
         point.steps + 1,
         point.changes,
     )
-    return Outcome(after, error if finite else math.inf, stages)
+    return Outcome(after, error if math.isfinite(total) else math.inf, stages)
 
 
 def step_factor(error: float, method: Method) -> float:
     """Return the next step's factor by a local error relative to the tolerance."""
     if error == 0.0:
         return LARGEST_GROWTH
-    if not error < math.inf:
+    if not math.isfinite(error):
         return LARGEST_SHRINKAGE
     factor: float = SAFETY * error ** (-1.0 / (method.error_order + 1))
     return min(max(factor, LARGEST_SHRINKAGE), LARGEST_GROWTH)

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 
 class DenseOutput(NamedTuple):
-    """The solution inside of a step, by stages that are taken after it.
+    """The solution inside of a step, by further stages that are taken after it.
 
-    The first of the further stages is the end of the step. With s = x / h, u = 1 - s,
+    The first of them is the end of the step. With s = x / h, u = 1 - s,
     slopes k, and states y_0 and y_1 at both ends the solution at x is
 
         y_0 + s (F_0 + u (F_1 + s (F_2 + u (F_3 + s (F_4 + ...)))))
@@ -32,7 +32,7 @@ class DenseOutput(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Tableau:
-    """An explicit method: stages a and c, weights b and those of error estimates."""
+    """The coefficients of an explicit Runge-Kutta method."""
 
     name: str
     order: int  # of the solution that goes on
@@ -192,7 +192,7 @@ DOP853 = Tableau(
 
 @dataclass(frozen=True)
 class Rosenbrock:
-    """A linearly implicit method in the form without matrix products.
+    """The coefficients of a linearly implicit method in the form without products J k.
 
     Its last stage is its error estimate, and the argument of that stage the embedded
     solution.
@@ -216,6 +216,10 @@ _RODAS5P_LAST = _row(
     "-7.502846399306121 2.561846144803919 -11.627539656261098 -0.18268767659942256 "
     "0.030198172008377946"
 )
+"""Weights of the first five stages in the arguments of the last three.
+
+The argument of each of these is the one before it plus the stage of that.
+"""
 
 RODAS5P = Rosenbrock(
     name="rodas5p",
@@ -278,6 +282,7 @@ METHODS: dict[str, Method] = {
 
 
 def _reduce(method: Method) -> Any:
+    """Return how a method is copied: by its name if it is one of METHODS."""
     if METHODS.get(method.name) is method:
         return _find, (method.name,)
     return type(method), tuple(vars(method).values())

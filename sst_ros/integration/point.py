@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,8 +17,13 @@ _ERROR_MARGIN = 2.0
 
 An error that only halves with the steps is twice as large.
 """
-_STEP_ROUNDING = 8 * 2.220446049250313e-16
+_STEP_ROUNDING = 8.0 * sys.float_info.epsilon
 """Error of a step by rounding, which a run of n steps has at least sqrt(n) times."""
+
+PAIR_STEPS = 3
+"""Steps that both solutions take over one step: one of its length, two of the half."""
+TWO_DRIVE_PAIR_STEPS = 6
+"""Steps that are counted for it where each solution has a drive of its own."""
 
 
 class MethodChange(NamedTuple):
@@ -29,9 +35,7 @@ class MethodChange(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Where a run stands: all that its next step depends on.
-
-    And how far it can be trusted.
+    """Where a run stands: all that its next step and its error estimate depend on.
 
     A second solution goes through each step by two of half the length: its distance is
     the error. No order is assumed, as none holds where a torque jumps, a clamp or a
@@ -57,6 +61,7 @@ class Point(NamedTuple):
     @property
     def rate_error(self) -> float:
         """Estimated global error of the body rate [rad/s]."""
+        # Relative to the rate, as rounding is.
         speed = max(1.0, math.hypot(*self.y[STAR_RATE]))
         distance = math.dist(self.y[STAR_RATE], self.z[STAR_RATE]) / speed
         return speed * estimate_error(distance, self.steps)
@@ -68,9 +73,9 @@ def estimate_error(distance: float, steps: int) -> float:
 
 
 def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
-    """Angle between the orientations of two states that are near [rad].
+    """Return the angle between the orientations of two states that are near [rad].
 
-    q and -q are the same.
+    q and -q are the same orientation.
     """
     q = y[QUATERNION]
     p = z[QUATERNION]
@@ -78,10 +83,10 @@ def orientation_distance(y: Sequence[float], z: Sequence[float]) -> float:
 
 
 def state_distance(y: Sequence[float], z: Sequence[float]) -> float:
-    """Return the distance of orientations [rad], or that of the rest if larger.
+    """Return the distance of orientations [rad], or that of the others if larger.
 
-    That of the rest is relative to the rate. Rates below 1 rad/s count as 1 rad/s;
-    infinite where a number is not finite.
+    Others are all other numbers, relative to the rate, which counts as 1 rad/s at
+    least. The distance is infinite where a number is not finite.
     """
     speed = max(1.0, math.hypot(*z[STAR_RATE]))
     distance_of_others = math.dist(y[STAR_RATE.start :], z[STAR_RATE.start :])
@@ -105,7 +110,7 @@ class Drive(NamedTuple):
     """What acts from outside over a period."""
 
     numbers: tuple[float, ...]
-    """Torques [N m], or phases of a sine [rad], or zero where a function gives the
+    """First torques [N m], phases of a sine [rad], or zeros where a function gives the
     torques; then the moment on the star in {B} [N m] where the scene takes one.
     """
     function: TorqueProfile | None = None  # torques that the steps evaluate
@@ -124,7 +129,7 @@ class Outcome(NamedTuple):
     """What a step from a point has given."""
 
     point: Point
-    size: float  # of the local error, in units of the tolerance; infinite if not finite
+    size: float  # of the local error, infinite where a number is not finite
     stages: Sequence[Any] = ()  # evaluated in it, for states inside
 
 
@@ -145,12 +150,12 @@ class Step(NamedTuple):
     def cost(self) -> int:
         """Evaluations of both solutions."""
         cost: int = self.steps.cost
-        return (3 if self.other is None else 6) * cost
+        return cost * (PAIR_STEPS if self.other is None else TWO_DRIVE_PAIR_STEPS)
 
     def inside(self, x: float) -> list[float]:
         """Return the state x [s] after its begin, by a shorter step.
 
-        Nan if not finite.
+        The numbers are nan where the step has no finite result.
         """
         state: list[float] = self.steps.single(self.t, x, self.begin.y, self.drive)
         return state

@@ -10,8 +10,8 @@
 4. A step that may pass a limit, or meet or leave an elastic stop, ends at the first of
    them.
 5. A step does not leap over the rates within which Coulomb friction changes its sign.
-6. A limit ends the motion: LimitReached. So does a motion that no step resolves:
-CannotStep.
+6. A limit ends the motion by LimitReached. Where no step resolves the motion,
+   CannotStep ends it.
 
 What a step computes is in `steps.py`; what it starts from and ends with is a `Point`.
 """
@@ -56,6 +56,7 @@ from sst_ros.integration.method_steps import (
     steps_of,
 )
 from sst_ros.integration.methods import (
+    AUTO,
     DOP853,
     DORMAND_PRINCE,
     METHODS,
@@ -64,6 +65,8 @@ from sst_ros.integration.methods import (
     Rosenbrock,
 )
 from sst_ros.integration.point import (
+    PAIR_STEPS,
+    TWO_DRIVE_PAIR_STEPS,
     Drive,
     Drives,
     MethodChange,
@@ -93,29 +96,25 @@ _SHORTEST_IN_TRANSITION = 1e-9
 """Relative to the time: friction that changes within less is one that jumps, and a step
 is not made shorter for it."""
 _SHORTEST_SEARCH = 1e-13
-"""Relative to the time: in a shorter step no jump is looked for.
-
-It would lie within rounding.
-"""
+"""Relative to the time: in a shorter step a jump would lie within rounding."""
 _UNWATCHED = 1e-3
-"""Longest steps [s] that are not looked at for pulses, such as ticks of a simulation.
+"""Length [s] up to which a step is not searched for pulses, as a tick of a simulation.
 
-No more than 0.3 ms lie between their stages.
+No more than 0.3 ms lie between its stages.
 """
 _MOST_LOOKS = 60
 """Times that a step is made shorter for a pulse: by halves down to rounding."""
 _JUMP_MARGIN = 4e-16
 """Relative to the time: distance of steps from a jump, before it and after it."""
 _BEHIND_A_KINK = 1e-14
-"""Angle [rad] by which a step goes beyond a kink.
-
-There the Jacobian is that of its far side.
-"""
+"""Angle [rad] by which a step goes beyond a kink, to the Jacobian of its far side."""
 _LARGEST_SHARE_BEHIND = 1e-3
 """...but by no more than this share of the step, where the joint hardly moves."""
+_NEARLY_ZERO = 1e-200
+"""Least length of a step [s], and least rate that is divided by."""
 
 _CHOOSE_EVERY = 16
-"""Attempts after which `auto` looks at the method."""
+"""Attempted steps after which `auto` looks at the method."""
 _CHOOSE_AFTER_REJECTIONS = 3
 """Rejections in a row after which it does so, too.
 
@@ -126,6 +125,10 @@ _STIFF = 2.0
 """Step times fastest decay above which an explicit method is left.
 
 It is stable to about 3.
+"""
+_DECAYING = 0.5
+"""Share of the fastest rate that the fastest decay has at least in a stiff motion: a
+fast oscillation has to be resolved, and an implicit method would gain nothing.
 """
 _EASY = 0.5
 """Step times fastest rate below which an implicit method is left."""
@@ -164,19 +167,21 @@ class EvaluationBudget:
         self.per_period = per_period
         self._whole_run = whole_run
         self.spent = 0
-        self._end = per_period
+        self._limit = per_period  # of `spent`, in this period
 
     def begin(self) -> None:
         """Begin a period."""
         if not self._whole_run:
-            self._end = self.per_period + self.spent
+            self._limit = self.spent + self.per_period
 
     def charge(self, evaluations: int) -> None:
         """Count evaluations before they are made.
 
-        BudgetSpent: the period has none left.
+        Raises:
+            BudgetSpent: the period does not have so many left.
+
         """
-        if self.spent + evaluations > self._end:
+        if self.spent + evaluations > self._limit:
             span = "motion" if self._whole_run else "step"
             raise BudgetSpent(
                 f"{self.per_period} evaluations do not reach the end of the {span}"
@@ -187,8 +192,7 @@ class EvaluationBudget:
 class Stepper:
     """Advances a scene through periods.
 
-    Nothing changes in it as a run goes on but what its budget has spent: the run is its
-    points.
+    As a run goes on, only its budget changes: where the run is, its points say.
 
     Args:
         scene: what is simulated.
@@ -208,7 +212,7 @@ class Stepper:
 
     """
 
-    _traces_clamped_sines = False
+    _traces_clamped_sines = False  # see `traced_sine`; a subclass may set it
 
     def __init__(
         self,
@@ -230,25 +234,30 @@ class Stepper:
         self._events = (*ends, *contacts)
         self._ranges = ranges_of([*ends, *free_range(contacts)])
         self._transitions = transitions_of(scene, tolerance)
-        traced = derivative is None
         self.torque = AppliedTorque(self.dynamics, scene.torque_limit)
         self._derivative = derivative
         self._tolerance = tolerance
         self._max_step = max_step
         self._methods = methods_of(method)
-        # A derivative of its own has no Jacobian to choose a method by.
-        self._chooses = len(self._methods) > 1 and traced
+        # A derivative in plain Python has no Jacobian to choose a method by.
+        self._chooses = len(self._methods) > 1 and derivative is None
+        # by a traced sine, whether a function takes the state, and the method
         self._steps: dict[tuple[SineTorque | None, bool | None, str], Steps] = {}
 
     def begin(self, y: Sequence[float], method: Method | None = None) -> Point:
-        """Complete quaternion, body rate and lagged torques to a point.
+        """Return the point at which a run begins.
 
-        The torques are zero by default. A run begins with `method`, by default the
-        first of those that it may use.
+        Args:
+            y: quaternion and body rate, then lagged torques [N m] and work [J], which
+                are zero by default.
+            method: the first method, by default the first of those that the run may
+                use.
+
         """
-        full = [*y, *(0.0,) * (len(self.ode.state) - len(y))]
-        joints = tuple(self.dynamics.joints(*full[STAR]))
-        return Point(full, list(full), joints, method or self._methods[0])
+        missing = len(self.ode.state) - len(y)
+        state = [*y, *[0.0] * missing]
+        joints = tuple(self.dynamics.joints(*state[STAR]))
+        return Point(state, list(state), joints, method or self._methods[0])
 
     def load(self) -> None:
         """Have the code compiled that periods under constant torques may need."""
@@ -256,7 +265,8 @@ class Stepper:
 
         no_moment = (0.0,) * len(self.dynamics.drive[MOMENT])
         drive = self._drive_of(Period(0.0, 0.0, ZERO, no_moment))
-        for method in self._methods if self._chooses else self._methods[:1]:
+        methods = self._methods if self._chooses else self._methods[:1]
+        for method in methods:
             self._steps_of(drive, method).load()
         if self._chooses:
             _ = self.ode.linearised
@@ -286,13 +296,13 @@ class Stepper:
             BudgetSpent: the period takes more evaluations than it may.
 
         """
-        drives = self._hold(period)
+        drives = self._drives_of(period)
         self.budget.begin()
-        x = 0.0
-        stops = list[float]()
+        t = 0.0
+        stops: list[float] = []  # times before and after a jump, at which steps end
         steps = self._steps_of(drives.first, point.method)
-        while x < period.h:
-            step = self._take_step(x, period.h, point, drives, stops, steps)
+        while t < period.h:
+            step = self._take_step(t, period.h, point, drives, stops, steps)
             steps = step.steps
             event = None
             if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
@@ -306,25 +316,24 @@ class Stepper:
                 visit(step)
             point = step.end
             if event is not None:
-                x = step.t + step.h
+                t += step.h
                 stops.clear()
                 if event.error is not None:
-                    raise LimitReached(event, period.start + x)
+                    raise LimitReached(event, period.start + t)
             elif step.last:
                 break
-            elif stops and step.h == stops[0] - x:
-                x = stops.pop(0)
+            elif stops and step.h == stops[0] - t:
+                t = stops.pop(0)
             else:
-                x += step.h
+                t += step.h
         return point
 
-    def _hold(self, period: Period) -> Drives:
+    def _drives_of(self, period: Period) -> Drives:
         """Return what acts in a period on both solutions."""
-        second = period.second_torque
-        return Drives(
-            self._drive_of(period),
-            None if second is None else Drive((*second, *period.moment)),
-        )
+        second_drive = None
+        if period.second_torque is not None:
+            second_drive = Drive((*period.second_torque, *period.moment))
+        return Drives(self._drive_of(period), second_drive)
 
     def _drive_of(self, period: Period) -> Drive:
         """Return what acts in a period on the first solution."""
@@ -338,19 +347,23 @@ class Stepper:
         sine = self.traced_sine(torque)
         if sine is None:
             return Drive((*ZERO, *moment), torque, start)
-        rows = zip(sine.frequency, sine.phase, strict=True)
-        phases = (math.fmod(f * start + phase, math.tau) for f, phase in rows)
+        phases = []
+        for frequency, phase in zip(sine.frequency, sine.phase, strict=True):
+            phases.append(math.fmod(frequency * start + phase, math.tau))
         return Drive((*phases, *moment), None, start, sine)
 
     def traced_sine(self, torque: Torque) -> SineTorque | None:
         """Return a sine that is part of the traced equations, None for other torques.
 
-        The steps evaluate one that the actuators clamp, as its kinks divide the motion.
+        A sine that the actuators clamp is not, unless `_traces_clamped_sines`: the
+        steps evaluate it, as its kinks divide the motion.
         """
         if not isinstance(torque, SineTorque) or self._derivative is not None:
             return None
         is_clamped = self.torque.limit_of(torque) is not None
-        return None if is_clamped and not self._traces_clamped_sines else torque
+        if is_clamped and not self._traces_clamped_sines:
+            return None
+        return torque
 
     def _steps_of(self, drive: Drive, method: Method) -> Steps:
         """Return the steps of a method under a drive."""
@@ -388,10 +401,11 @@ class Stepper:
     ) -> Step:
         """Take one step that is accepted, from t to `end` at most.
 
-        `stops` are the times just before and after a jump that was found, where steps
-        end; `steps` those that the last step was taken by.
+        `steps` have taken the last step. `stops` changes where a jump is found: to the
+        times just before and after it, at which steps end.
         """
         drive, second = drives
+        pair_steps = PAIR_STEPS if second is None else TWO_DRIVE_PAIR_STEPS
         rejected = 0
         leaps = 0
         looks = 0
@@ -399,13 +413,14 @@ class Stepper:
             if steps.method is not point.method:
                 steps = self._steps_of(drive, point.method)
             h = self._length_of(point, t, end, stops)
-            self.budget.charge((3 if second is None else 6) * steps.cost)
+            self.budget.charge(pair_steps * steps.cost)
             after, size, stages = steps.pair(t, h, point, drive, second)
             error = size / self._tolerance
             if size <= self._tolerance:
                 if looks < _MOST_LOOKS and self._meets_pulse(t, h, point, drive, stops):
                     looks += 1
-                    point = point._replace(h=h if stops else 0.5 * h)
+                    shorter = h if stops else 0.5 * h
+                    point = point._replace(h=shorter)
                     continue
                 ends = point.joints, after.joints
                 passed = largest_passed(self._transitions, *ends)
@@ -427,7 +442,7 @@ class Stepper:
                 point = point._replace(h=h)
                 continue
             point = point._replace(h=h * min(step_factor(error, point.method), 1.0))
-            if point.h < _SHORTEST_STEP * max(abs(t), end - t) or point.h < 1e-200:
+            if point.h < max(_SHORTEST_STEP * max(abs(t), end - t), _NEARLY_ZERO):
                 raise CannotStep(f"steps of {point.h:.1e} s do not resolve it")
             rejected += 1
             if self._chooses:
@@ -461,7 +476,9 @@ class Stepper:
         h = step.h
         begin = step.begin
         end = step.end
-        longest = _next_length(begin, h, error, cut=is_cut)
+        longest = h * step_factor(error, begin.method)
+        if is_cut:  # it does not say that the next must be shorter than allowed before
+            longest = max(begin.h, longest)
         if passed > 0.0:  # the next step is not to be refused for a leap
             longest = min(longest, SAFETY * h / passed)
         is_implicit = isinstance(begin.method, Rosenbrock)
@@ -489,30 +506,26 @@ class Stepper:
         The eigenvalues of the Jacobian decide. `rejected` counts the attempts in a row
         that were rejected.
         """
-        early = rejected == _CHOOSE_AFTER_REJECTIONS and not isinstance(
-            point.method, Rosenbrock
-        )
-        if point.attempts < _CHOOSE_EVERY and not early:
+        is_explicit = not isinstance(point.method, Rosenbrock)
+        is_early = is_explicit and rejected == _CHOOSE_AFTER_REJECTIONS
+        if point.attempts < _CHOOSE_EVERY and not is_early:
             return point
-        if not early:
+        if not is_early:
             point = point._replace(attempts=0)
         self.budget.charge(JACOBIAN_COST)
         try:
             jacobian = steps.jacobian(t, point.y, drive)
         except ArithmeticError:
             return point  # no finite Jacobian here; the step size has to do
-        # Nothing depends on the work, the last number, which adds an eigenvalue of
-        # zero.
-        only_stiff = early or point.method is DOP853 or self._tolerance >= ACCURATE
-        if (
-            only_stiff
-            and not isinstance(point.method, Rosenbrock)
-            and h * bound_of_eigenvalues(jacobian[:-1, :-1]) <= _STIFF
-        ):
-            return point
+        has_its_order = point.method is DOP853 or self._tolerance >= ACCURATE
+        if is_explicit and (is_early or has_its_order):  # only stiffness may change it
+            moving = jacobian[:-1, :-1]  # nothing depends on the work, the last number
+            is_stiff = h * bound_of_eigenvalues(moving) > _STIFF
+            if not is_stiff:
+                return point
         eigenvalues = np.asarray(np.linalg.eigvals(jacobian), dtype=complex)
         method, reason = better_method(
-            point.method, self._tolerance, h * eigenvalues, only_stiff=early
+            point.method, self._tolerance, h * eigenvalues, only_stiff=is_early
         )
         if method is point.method:
             return point
@@ -523,9 +536,9 @@ class Stepper:
         self, t: float, h: float, y: Sequence[float], drive: Drive
     ) -> list[float]:
         """Return times just before and after a torque's jump in a step, if any."""
-        if drive.function is None or h < _SHORTEST_SEARCH * max(
-            abs(drive.start + t), h
-        ):
+        if drive.function is None:
+            return []
+        if h < _SHORTEST_SEARCH * max(abs(drive.start + t), h):
             return []
         return self._stops_at_jump(t, t + h, y, drive, t, h)
 
@@ -542,16 +555,18 @@ class Stepper:
         jump = self.torque.locate_jump(drive, begin, end, y)
         if jump is None:
             return []
-        margin = _JUMP_MARGIN * max(abs(drive.start + jump[1]), h)
-        return [stop for stop in (jump[0] - margin, jump[1] + margin) if stop > t]
+        before, after = jump
+        margin = _JUMP_MARGIN * max(abs(drive.start + after), h)
+        return [stop for stop in (before - margin, after + margin) if stop > t]
 
     def _meets_pulse(
         self, t: float, h: float, point: Point, drive: Drive, stops: list[float]
     ) -> bool:
-        """Return whether a step passes over a pulse of a function of the time.
+        """Return whether a step must be shortened for a pulse that it passes over.
 
-        Its stages may have met nothing of it. Where the pulse begins or ends by a jump
-        the times around that become `stops`.
+        That is a pulse of a function of the time, of which its stages may have met
+        nothing. Where the pulse begins or ends by a jump, `stops` changes to the times
+        around the jump.
         """
         if drive.function is None or drive.function.feedback or h <= _UNWATCHED:
             return False
@@ -559,15 +574,18 @@ class Stepper:
         if pulse is None:
             return False
         edges = self._stops_at_jump(pulse.begin, pulse.end, point.y, drive, t, h)
-        if edges and edges != stops:
-            stops[:] = edges
-            return True
-        return pulse.is_large and not edges
+        if not edges:
+            return pulse.is_large
+        if edges == stops:  # steps end at this jump already
+            return False
+        stops[:] = edges
+        return True
 
     def _until_event(self, step: Step) -> tuple[Step, Limit | None]:
-        """Return an accepted step up to the first event in it, and that, or all of it.
+        """Return an accepted step up to its first event, and the event.
 
-        Raises _NoState where a state inside is not finite.
+        The step is returned whole, with None, if it has no event. Raises _NoState where
+        a state inside is not finite.
         """
         begin, end = step.begin.joints, step.end.joints
         possible_events = [
@@ -578,6 +596,7 @@ class Stepper:
 
         @cache
         def joints(x: float) -> Sequence[float]:
+            """Return the joints at x [s] after the begin of the step."""
             if x == 0.0:
                 return begin
             if x == step.h:
@@ -594,8 +613,9 @@ class Stepper:
             return step, None
         x, event = first
         if event.error is None:
-            beyond = x + _BEHIND_A_KINK / max(abs(event.slope(joints(x))), 1e-200)
-            x = min(beyond, x + _LARGEST_SHARE_BEHIND * step.h, step.h)
+            rate = max(abs(event.slope(joints(x))), _NEARLY_ZERO)
+            beyond = min(_BEHIND_A_KINK / rate, _LARGEST_SHARE_BEHIND * step.h)
+            x = min(x + beyond, step.h)
         return self._shorten(step, x), event
 
     def _shorten(self, step: Step, x: float) -> Step:
@@ -616,22 +636,23 @@ def methods_of(name: str) -> tuple[Method, ...]:
 
     `name` is that of a method, or auto.
     """
-    method = METHODS.get(name)
-    return (method,) if method else (DORMAND_PRINCE, DOP853, RODAS5P)
+    if name == AUTO:
+        return DORMAND_PRINCE, DOP853, RODAS5P
+    return (METHODS[name],)
 
 
 def better_method(
-    method: Method, tolerance: float, steps: NDArray[Any], *, only_stiff: bool
+    method: Method, tolerance: float, rates: NDArray[Any], *, only_stiff: bool
 ) -> tuple[Method, str]:
     """Choose the method that would take longer steps, and state why.
 
-    It is the one in use where none would. `steps` is the length of a step times the
-    eigenvalues of the Jacobian; `only_stiff` looks for stiffness alone.
+    It is the one in use where none would. `rates` are the eigenvalues of the Jacobian
+    times the length of a step; `only_stiff` looks for stiffness alone.
     """
-    radius = np.abs(steps).max()
-    decay = -steps.real.min()
+    radius = np.abs(rates).max()
+    decay = -rates.real.min()
     implicit = isinstance(method, Rosenbrock)
-    if not implicit and decay > _STIFF and decay > 0.5 * radius:
+    if not implicit and decay > _STIFF and decay > _DECAYING * radius:
         return RODAS5P, f"stiff: step times fastest decay is {decay:.2g}"
     if only_stiff:
         return method, ""
@@ -643,16 +664,9 @@ def better_method(
 
 
 def bound_of_eigenvalues(matrix: Array) -> float:
-    """Return a number that no eigenvalue exceeds, at a fraction of their cost."""
+    """Return a bound of all magnitudes of eigenvalues, at a fraction of their cost.
+
+    Both the largest sum of a row and that of a column are one.
+    """
     sizes = np.abs(matrix)
     return float(min(sizes.sum(axis=0).max(), sizes.sum(axis=1).max()))
-
-
-def _next_length(point: Point, h: float, error: float, *, cut: bool) -> float:
-    """Return the longest step after an accepted one of h, by its local error.
-
-    The error is relative to the tolerance. A step that was cut does not say that the
-    next must be shorter than the longest of before.
-    """
-    length = h * step_factor(error, point.method)
-    return max(point.h, length) if cut else length

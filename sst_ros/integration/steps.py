@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from sst_ros.integration.methods import Rosenbrock, Tableau
 from sst_ros.mechanism.generic_math import absolute, larger, select, sqrt
-from sst_ros.state import QUATERNION, STAR, STAR_RATE
+from sst_ros.state import LAGGED_TORQUES, QUATERNION, STAR_RATE
 
 Number = Any
 Numbers = Sequence[Any]
@@ -32,13 +32,19 @@ _NO_DIVISION_BY_ZERO = 1e-300
 
 
 class NewState(NamedTuple):
-    """Where a step ends, and what the method knows of its error.
-
-    None where it knows nothing.
-    """
+    """Where a step ends, and the method's estimate of its error; None without one."""
 
     state: list[Number]
     error: list[Number] | None
+
+    @classmethod
+    def of(cls, numbers: Numbers, size: int) -> NewState:
+        """Read a state of `size` numbers, and the error behind it, if any."""
+        return cls([*numbers[:size]], [*numbers[size:]] or None)
+
+    def numbers(self) -> list[Number]:
+        """Return the state, and the error behind it, if any."""
+        return [*self.state, *(self.error or ())]
 
 
 def explicit_step(
@@ -61,6 +67,7 @@ def explicit_step(
 
     """
     slopes: list[Numbers] = []
+    # What a zero adds is left out: a program that is traced then has no such operation.
     for node, weights, drive in zip(method.c, method.a, drives, strict=True):
         time = t + node * h if node else t
         point = move(y, h, weights, slopes) if slopes else y
@@ -80,14 +87,17 @@ def move(
     y: Numbers, h: Number, weights: Sequence[float], slopes: Sequence[Numbers]
 ) -> list[Any]:
     """Return y + h (sum of weights times slopes)."""
-    return [
-        number + h * _weigh(weights, [slope[i] for slope in slopes])
-        for i, number in enumerate(y)
-    ]
+    moved = []
+    for number, rates in zip(y, zip(*slopes, strict=True), strict=True):
+        moved.append(number + h * _weigh(weights, rates))
+    return moved
 
 
 def _weigh(weights: Sequence[float], numbers: Numbers) -> Number:
-    """Return the sum of weights times numbers, from the first to the last."""
+    """Return the sum of weights times numbers, from the first to the last.
+
+    Weights that are zero cost no operation.
+    """
     total = None
     for weight, number in zip(weights, numbers, strict=True):
         if weight:
@@ -141,34 +151,36 @@ def rosenbrock_step(
     solution adds to the embedded one. The Jacobian may be that of a point near y. See
     `explicit_step` for the arguments.
     """
-    size = len(y)
-    matrix = [[-column[i] for column in linearisation.columns] for i in range(size)]
-    for i in range(size):
-        matrix[i][i] = matrix[i][i] + 1.0 / (method.gamma * h)
+    columns = linearisation.columns
+    # 1 / (gamma h) - J, by rows
+    matrix = [[-number for number in row] for row in zip(*columns, strict=True)]
+    for i, row in enumerate(matrix):
+        row[i] = row[i] + 1.0 / (method.gamma * h)
     decomposition = factorise(matrix)
-    stages: list[Numbers] = []
-    point = list(y)
-    for weights, couplings, node, by_time in zip(
+    stages: list[list[Number]] = []
+    for weights, couplings, node, time_weight in zip(
         method.a, method.c, method.alpha, method.d, strict=True
     ):
-        point = list(y)
+        point: Numbers = y
         for weight, stage in zip(weights, stages, strict=True):
-            point = [
-                number + weight * x for number, x in zip(point, stage, strict=True)
-            ]
+            point = _add_multiple(point, weight, stage)
         slope = derivative(t + node * h, point, drive)
-        right = [
-            number + h * by_time * rate
-            for number, rate in zip(slope, linearisation.by_time, strict=True)
-        ]
+        right_side = _add_multiple(slope, h * time_weight, linearisation.by_time)
         for coupling, stage in zip(couplings, stages, strict=True):
-            right = [
-                number + coupling / h * x
-                for number, x in zip(right, stage, strict=True)
-            ]
-        stages.append(substitute(decomposition, right))
-    error = list(stages[-1])
-    return NewState([number + x for number, x in zip(point, error, strict=True)], error)
+            right_side = _add_multiple(right_side, coupling / h, stage)
+        stages.append(substitute(decomposition, right_side))
+    error = stages[-1]
+    # The last point is the embedded solution.
+    return NewState([a + b for a, b in zip(point, error, strict=True)], error)
+
+
+def _add_multiple(numbers: Numbers, factor: Number, others: Numbers) -> list[Number]:
+    """Return numbers + factor * others."""
+    return [a + factor * b for a, b in zip(numbers, others, strict=True)]
+
+
+def _subtract(numbers: Numbers, others: Numbers) -> list[Number]:
+    return [a - b for a, b in zip(numbers, others, strict=True)]
 
 
 class Decomposition(NamedTuple):
@@ -185,9 +197,9 @@ class Decomposition(NamedTuple):
 def factorise(matrix: Sequence[Numbers]) -> Decomposition:
     """Decompose a matrix with partial pivoting.
 
-    Without a branch: each row below changes places with the k-th where it has the
-    larger number, so the largest comes to stand in the k-th row, and which rows change
-    is data.
+    There is no branch, so it can be traced: each row below the k-th changes places with
+    it where its k-th number is larger. The largest then is in the k-th row. Which rows
+    change places is data.
     """
     rows = [list(row) for row in matrix]
     size = len(rows)
@@ -229,12 +241,12 @@ def substitute(decomposition: Decomposition, right: Numbers) -> list[Number]:
     return x
 
 
-def normalise(y: Numbers) -> list[Number]:
+def normalise(state: Numbers) -> list[Number]:
     """Return a state whose quaternion has length 1."""
-    x, y_, z, w = y[QUATERNION]
-    factor = 1.0 / sqrt(x * x + y_ * y_ + z * z + w * w)
-    quaternion = [number * factor for number in y[QUATERNION]]
-    return [*quaternion, *y[QUATERNION.stop :]]
+    x, y, z, w = state[QUATERNION]
+    factor = 1.0 / sqrt(x * x + y * y + z * z + w * w)
+    others = state[QUATERNION.stop :]
+    return [x * factor, y * factor, z * factor, w * factor, *others]
 
 
 def size_of_error(
@@ -242,40 +254,40 @@ def size_of_error(
 ) -> Number:
     """Return the largest error of a step relative to what it is an error of.
 
-    Quaternion: absolute. Rate: relative to its length, but not below 1e-3 rad a step,
-    so that rest can be reached. Lagging torques, which are `lagged` numbers: relative
-    to the largest of them. The work is not looked at.
+    That of the quaternion is absolute. That of the rate is relative to its largest
+    component, which counts as 1e-3 rad a step at least, so that rest can be reached.
+    That of the torques that lag, if there are `lagged` of them, is relative to the
+    largest torque. The work has none.
     """
     largest: Number = 0.0
     for number in error[QUATERNION]:
         largest = larger(largest, absolute(number))
-    rate, worst = _measure_error(error, old, new, STAR_RATE, least=0.0)
+    rate, rate_error = _measure_error(error, old, new, STAR_RATE, least=0.0)
     least_rate = _RADIANS_PER_STEP / absolute(h)
-    largest = larger(largest, worst / larger(rate, least_rate))
+    largest = larger(largest, rate_error / larger(rate, least_rate))
     if lagged:
-        torques = slice(STAR.stop, STAR.stop + lagged)
-        torque, worst = _measure_error(
-            error, old, new, torques, least=_NO_DIVISION_BY_ZERO
+        torque, torque_error = _measure_error(
+            error, old, new, LAGGED_TORQUES, least=_NO_DIVISION_BY_ZERO
         )
-        largest = larger(largest, worst / torque)
+        largest = larger(largest, torque_error / torque)
     return largest
 
 
 def _measure_error(
     error: Numbers, old: Numbers, new: Numbers, indices: slice, least: float
 ) -> tuple[Number, Number]:
-    """Return the largest absolute number at some indices, and the largest error.
+    """Return the size of some numbers of the state, and that of their error.
 
-    The number is of two states, and at least `least`.
+    The first is the largest magnitude in the state before and after, at least `least`.
     """
-    length: Number = least
-    worst: Number = 0.0
-    for before, after, change in zip(
+    size: Number = least
+    size_of_error: Number = 0.0
+    for before, after, error_of_one in zip(
         old[indices], new[indices], error[indices], strict=True
     ):
-        length = larger(larger(length, absolute(before)), absolute(after))
-        worst = larger(worst, absolute(change))
-    return length, worst
+        size = larger(larger(size, absolute(before)), absolute(after))
+        size_of_error = larger(size_of_error, absolute(error_of_one))
+    return size, size_of_error
 
 
 class Pair(NamedTuple):
@@ -301,10 +313,10 @@ def step_pair(
     """Advance the solution y by a step of h, and a second one, z, by two of h / 2.
 
     Args:
-        step: (number, time, length, state, point) -> the new state: number 0 is the
-            step of y, and 1 and 2 are those of z. A Jacobian is that of the state
-            `point`, which is y for the first step of z: beside a kink of a force both
-            solutions then have the same.
+        step: takes a step: (number, time, length, state, point) -> the new state. The
+            step of y has the number 0, those of z have 1 and 2. The Jacobian is taken
+            at `point`. That is y for the first step of z, too, so that both solutions
+            have the same Jacobian beside a kink of a force.
         t: time at which the step begins [s].
         h: its length [s].
         y: first solution.
@@ -329,19 +341,22 @@ def compare(
     new_y, error_y = first
     new_z, error_z = second
     if error_y is None:  # the method has no estimate of its own
-        error_y = [
-            (after_z - before_z) - (after_y - before_y)
-            for after_z, before_z, after_y, before_y in zip(
-                new_z, z, new_y, y, strict=True
-            )
-        ]
+        error_y = _subtract(_subtract(new_z, z), _subtract(new_y, y))
     size = size_of_error(error_y, y, new_y, h, lagged)
     total = add_up([*new_y, *error_y, *new_z, *(error_z or ())])
     return Pair(normalise(new_y), normalise(new_z), size, total)
 
 
+def split(numbers: Numbers, size: int) -> list[Numbers]:
+    """Divide numbers into consecutive groups of `size`."""
+    return [numbers[k : k + size] for k in range(0, len(numbers), size)]
+
+
 def add_up(numbers: Numbers) -> Number:
-    """Return the sum of numbers, from the first to the last."""
+    """Return the sum of numbers, from the first to the last.
+
+    The built-in `sum` has other bits from Python 3.12 on.
+    """
     total: Number = 0.0
     for number in numbers:
         total = total + number

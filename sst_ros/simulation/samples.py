@@ -14,7 +14,7 @@ from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.point import Step
 from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import Torque
-from sst_ros.state import LAGGED_TORQUES, QUATERNION, STAR, STAR_RATE, Array
+from sst_ros.state import LAGGED_TORQUES, QUATERNION, STAR, STAR_RATE, Array, Vector3
 
 
 class SampleTable(NamedTuple):
@@ -27,26 +27,24 @@ class SampleTable(NamedTuple):
     joints: Array  # nine angles [rad] and nine rates [rad/s], (n, 18)
 
 
-class _Run(NamedTuple):
-    """Consecutive samples inside one step.
+class _StepSamples(NamedTuple):
+    """Consecutive samples inside one step, each by one shorter step from its begin."""
 
-    Each state is one shorter step from its begin.
-    """
-
-    first: int  # number of the first sample
     step: Step
     begin: float  # time at which the step begins [s]
+    first: int  # place of the first sample among all
     number: int  # of samples
 
 
 class Samples:
     """Samples of a motion of a stepper.
 
-    Those inside of steps are computed together, by the program of a step over rows.
+    Those inside of steps are computed together at the end, by a compiled step over
+    rows.
 
     Attributes:
-        evaluations: that this takes; they are no part of a motion's budget, as they
-            have a bound.
+        evaluations: that this takes. A motion's budget does not have them: they do not
+            grow without bound.
 
     """
 
@@ -54,8 +52,8 @@ class Samples:
         self._stepper = stepper
         self._times: list[float] = []
         self._torques: list[tuple[int, Torque]] = []  # each from its sample on
-        self._states: list[tuple[int, Sequence[float]]] = []
-        self._runs: list[_Run] = []
+        self._states: list[tuple[int, Sequence[float]]] = []  # of some samples
+        self._step_samples: list[_StepSamples] = []  # the others
         self.evaluations = 0
 
     def add(self, time: float, torque: Torque, y: Sequence[float]) -> None:
@@ -76,7 +74,8 @@ class Samples:
             return
         if isinstance(step.steps, (MethodSteps, TimeSteps)):
             self.evaluations += len(times) * step.steps.cost
-            self._runs.append(_Run(len(self._times), step, begin, len(times)))
+            first = len(self._times)
+            self._step_samples.append(_StepSamples(step, begin, first, len(times)))
             self._note(times, torque)
             return
         for time in times:
@@ -84,6 +83,7 @@ class Samples:
             self.add(time, torque, step.inside(time - begin))
 
     def _note(self, times: Sequence[float], torque: Torque) -> None:
+        """Note times of samples, and the torque that acts at them."""
         if not self._torques or self._torques[-1][1] is not torque:
             self._torques.append((len(self._times), torque))
         self._times += times
@@ -93,8 +93,8 @@ class Samples:
         t = np.array(self._times)
         states = np.empty((len(t), len(self._stepper.ode.state)))
         if self._states:
-            rows, noted_states = zip(*self._states, strict=True)
-            states[list(rows)] = noted_states
+            places, noted_states = zip(*self._states, strict=True)
+            states[list(places)] = noted_states
         self._step_to(t, states)
         joints = self._stepper.dynamics.joints_of_rows(states[:, STAR])
         torque = self._torque_at(t, states, joints)
@@ -104,38 +104,46 @@ class Samples:
 
     def _step_to(self, t: Array, states: Array) -> None:
         """Fill in the states inside of steps."""
-        by_steps: dict[int, list[_Run]] = {}
-        for run in self._runs:
-            by_steps.setdefault(id(run.step.steps), []).append(run)
-        for runs in by_steps.values():
-            taken = [run.step for run in runs]
-            counts = [run.number for run in runs]
-            before = np.cumsum([0, *counts[:-1]])
-            offsets = np.array([run.first for run in runs]) - before
-            numbers = np.arange(sum(counts)) + offsets.repeat(counts)
-            x = t[numbers] - np.array([run.begin for run in runs]).repeat(counts)
-            states[numbers] = taken[0].steps.states_inside(taken, counts, x)
+        groups: dict[int, list[_StepSamples]] = {}  # those of one program together
+        for samples in self._step_samples:
+            groups.setdefault(id(samples.step.steps), []).append(samples)
+        for group in groups.values():
+            steps, begins, firsts, counts = zip(*group, strict=True)
+            ranges = []
+            for first, count in zip(firsts, counts, strict=True):
+                ranges.append(np.arange(first, first + count))
+            places = np.concatenate(ranges)
+            x = t[places] - np.repeat(begins, counts)
+            states[places] = steps[0].steps.states_inside(steps, counts, x)
 
     def _torque_at(self, t: Array, states: Array, joints: Array) -> Array:
         """Return the torques that act, shape (n, 3)."""
-        # the actuators lag: they are part of the state
-        if states.shape[1] > STATE_SIZE + 1:
+        has_lag = states.shape[1] > STATE_SIZE + 1  # beside the star and the work
+        if has_lag:
             return states[:, LAGGED_TORQUES]
         torques = np.empty((len(t), 3))
+        end = len(t)
+        for first, torque in reversed(self._torques):
+            span = slice(first, end)
+            torques[span] = self._evaluate(torque, t[span], states[span], joints[span])
+            end = first
+        return torques
+
+    def _evaluate(
+        self, torque: Torque, t: Array, states: Array, joints: Array
+    ) -> Vector3 | Sequence[Vector3] | Array:
+        """Return a torque at consecutive samples, or the one of all that is held."""
+        if isinstance(torque, tuple):
+            return torque
+        if self._stepper.traced_sine(torque) is not None:
+            return torque.values(t)
+        times = t.tolist()
         applied = self._stepper.torque
-        ends = [first for first, _ in self._torques[1:]]
-        for (first, torque), end in zip(self._torques, [*ends, len(t)], strict=True):
-            if isinstance(torque, tuple):
-                torques[first:end] = torque
-            elif torque.feedback:
-                span = slice(first, end)
-                rows = (array[span].tolist() for array in (t, states, joints))
-                torques[span] = [
-                    applied.of_state(torque, time, state, angles)
-                    for time, state, angles in zip(*rows, strict=True)
-                ]
-            elif self._stepper.traced_sine(torque) is not None:
-                torques[first:end] = torque.values(t[first:end])
-            else:
-                torques[first:end] = applied.at_times(torque, t[first:end].tolist())
+        if not torque.feedback:
+            return applied.at_times(torque, times)
+        torques = []
+        for time, y, angles in zip(
+            times, states.tolist(), joints.tolist(), strict=True
+        ):
+            torques.append(applied.of_state(torque, time, y, angles))
         return torques

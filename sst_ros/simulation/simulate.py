@@ -54,27 +54,31 @@ _RUN_ATTEMPTS = 4
 """Runs until the error estimate is at most the tolerance."""
 _FINEST = 1e-14
 """Least tolerance of a step: below it rounding decides."""
+_RUN_MARGIN = 5.0
+"""Factor by which steps of the next run are more accurate than the error asks for."""
 _LEAST_GAIN = 0.5
 """Share of the last run's error: a run that keeps more of it is the last.
 
-Its steps have a fifth of the tolerance or less, so the error of a smooth motion falls
-farther; under torques that switch with the state it does not.
+The error of a smooth motion falls farther from run to run; under torques that switch
+with the state it does not.
 """
 _FUNCTION_BUDGET = 1_000_000
-"""Evaluations where each calls a function of the state: half a minute."""
+"""Most evaluations of a motion that calls a function in each: half a minute."""
 _BUDGET_PER_SECOND = 5_000
-"""Evaluations a second of motion that a long motion may take beyond that."""
+"""Most evaluations for each second of any other motion, if it is long enough for that
+to exceed WHOLE_MOTION_BUDGET.
+"""
 _LONGEST_BUDGET = 50_000_000
-"""Evaluations of any motion: a minute."""
+"""Most evaluations that a long motion gets by that: a minute."""
 _ADVICE = (
     "; if the torque function switches with the state, give control_period, as a"
     " controller has it, or smooth the switch"
 )
 
 _UNSEEN_ANSWER = 10.0
-"""Factor of the error estimate where it cannot see how a controller answers the error:
-of 170 random runs one has an error of more than ten times the estimate without that
-answer.
+"""Factor of the error estimate where a controller's answer to the error is unknown.
+
+Of 170 random runs one has an error of more than ten times the estimate without it.
 """
 
 _METHOD_WORDS = "must be one of " + ", ".join(INTEGRATORS)
@@ -201,15 +205,15 @@ def _read_duration(duration: float | None, scene: Scene) -> int:
     length = scene.duration if duration is None else duration
     if length is None:
         _refuse("duration", None, "must be given: the scene has none")
-    return _nanoseconds("duration", length)
+    return _read_nanoseconds("duration", length)
 
 
 def _check_method(method: str, tolerance: float) -> None:
-    """Refuse a method that is none, and a tolerance that is not a positive number."""
+    """Refuse an unknown method, and a tolerance that is not a positive number."""
     is_tolerance = 0.0 < tolerance < math.inf
     refuse_unless(
         "simulate",
-        ("method", method, method in INTEGRATORS, _allow_methods(method)),
+        ("method", method, method in INTEGRATORS, _require_method(method)),
         ("tolerance", tolerance, is_tolerance, "must be a number > 0 [rad]"),
     )
 
@@ -237,18 +241,16 @@ def _read_parameters(
     """Return the names that the motion is differentiated by."""
     names = (sensitivities,) if isinstance(sensitivities, str) else sensitivities
     if names:
-        Sensitivities(scene, names, profile)  # refuses what no motion is derived by
+        Sensitivities(scene, names, profile)  # refuses names that it does not know
     return tuple(names)
 
 
 def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
     """Run a motion by steps, again by smaller ones if the tolerance is not met.
 
-    It is met where the error estimate does not exceed it.
-
-    A function whose torques are held, and which may have a memory, runs once. All runs
-    share one budget; of two that do not meet the tolerance the one that reached the end
-    is kept.
+    It is met where the error estimate does not exceed it. A function whose torques are
+    held, and which may have a memory, runs once. All runs share one budget: one that is
+    run again and spends it is left out.
     """
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
     remembers = task.period is not None and not task.memoryless
@@ -269,17 +271,15 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
         if remembers or motion.status < 0 or is_met or gains_little:
             break
         last_excess = excess
-        step_tolerance = max(step_tolerance / (5.0 * excess), _FINEST)
+        step_tolerance = max(step_tolerance / (_RUN_MARGIN * excess), _FINEST)
     assert kept is not None
-    factor = 1.0
-    if remembers and task.torque.feedback:
-        # The estimate does not see how the controller answers the error.
-        factor = _UNSEEN_ANSWER
+    is_answer_unseen = remembers and task.torque.feedback
+    factor = _UNSEEN_ANSWER if is_answer_unseen else 1.0
     return _make_trajectory(task, kept, budget.spent, factor=factor)
 
 
 def _budget_of(task: Task) -> int:
-    """Return the evaluations a motion may take: fewer where they call a function."""
+    """Return the evaluations a motion may take: fewer where each calls a function."""
     if task.period is None and task.torque.feedback:
         return _FUNCTION_BUDGET
     begin, end = task.span
@@ -299,20 +299,16 @@ def _make_trajectory(
     message = motion.message
     if motion.status < 0:
         geometry = Geometry.of(task.scene)
-        conditioning_text = describe_conditioning(geometry, motion.state())
-        message = f"{message} ({conditioning_text})"
+        message += f" ({describe_conditioning(geometry, motion.state())})"
         if task.period is None and task.torque.feedback:
-            message = f"{message}{_ADVICE}"
+            message += _ADVICE
     status, message = check_error(error, task.tolerance, motion.status, message)
     if factor > 1.0 and error > task.tolerance:
-        message = (
-            f"{message} ({factor:g} times wider, as the function may have a memory)"
-        )
+        message += f" ({factor:g} times wider, as the function may have a memory)"
     samples = motion.samples.table()
-    changes = [
-        f"{change.method} from {change.time:g} s ({change.reason})"
-        for change in point.changes
-    ]
+    methods = [motion.start.method.name]
+    for change in point.changes:
+        methods.append(f"{change.method} from {change.time:g} s ({change.reason})")
     law = task.torque
     if motion.held:
         period_begins, torques = zip(*motion.held, strict=True)
@@ -320,7 +316,7 @@ def _make_trajectory(
     record = RunRecord(
         status=status,
         message=message,
-        method=", then ".join([motion.start.method.name, *changes]),
+        method=", then ".join(methods),
         error_estimate=error,
         evaluations=spent + motion.samples.evaluations,
         step=motion.time / max(point.steps, 1),
@@ -343,13 +339,14 @@ def _refuse(name: str, value: object, requirement: str) -> NoReturn:
     raise refusal("simulate", name, value, requirement) from None
 
 
-def _allow_methods(method: object) -> str:
+def _require_method(method: object) -> str:
     """Say which methods there are, and what to use instead of one that has left."""
     advice = REMOVED_METHODS.get(str(method))
     return _METHOD_WORDS if advice is None else f"{advice}; {_METHOD_WORDS}"
 
 
-def _nanoseconds(name: str, value: float) -> int:
+def _read_nanoseconds(name: str, value: float) -> int:
+    """Return a length of time [s] in nanoseconds."""
     # From one nanosecond to what a whole number of 64 bits holds of them.
     if not 1e-9 <= value <= 9e9:
         _refuse(name, value, "must be a number from 1e-9 to 9e9 [s]")
@@ -363,19 +360,13 @@ def _read_period(
     if period is None:
         return None
     if not isinstance(profile, FunctionTorque):
-        _refuse(
-            "control_period",
-            period,
-            "is for a function; give none for numbers and profiles",
-        )
-    length = _nanoseconds("control_period", period)
+        requirement = "is for a function; give none for numbers and profiles"
+        _refuse("control_period", period, requirement)
+    length = _read_nanoseconds("control_period", period)
     if span_ns > _MOST_PERIODS * length:
         least = span_ns / NANOSECONDS / _MOST_PERIODS
-        _refuse(
-            "control_period",
-            period,
-            f"must be at least {least:.3g} s for this duration",
-        )
+        requirement = f"must be at least {least:.3g} s for this duration"
+        _refuse("control_period", period, requirement)
     return length
 
 
@@ -384,33 +375,28 @@ def _read_times(
 ) -> Array:
     """Return the times of the samples [s], in whole nanoseconds."""
     if t_eval is None:
-        if samples is None and period is not None:
-            even_ns = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
-        else:
-            count = _DEFAULT_SAMPLES if samples is None else samples
-            if not 1 <= count <= _MOST_SAMPLES:
-                _refuse(
-                    "samples",
-                    samples,
-                    f"must be a whole number from 1 to {_MOST_SAMPLES}",
-                )
-            even_ns = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
-        return np.asarray(even_ns / NANOSECONDS)
+        return _divide_evenly(samples, span_ns, period)
     if samples is not None:
         _refuse("samples", samples, "must be None where t_eval gives their times")
     times = np.atleast_1d(read_numbers("simulate", "t_eval", t_eval, seconds=True))
     with np.errstate(over="ignore"):
         rounded_ns = np.rint(times * NANOSECONDS)
-    if not (
-        rounded_ns.size
-        and ascend(rounded_ns)
-        and rounded_ns[0] >= 0.0
-        and rounded_ns[-1] <= span_ns
-    ):
+    is_inside = bool(np.all((rounded_ns >= 0.0) & (rounded_ns <= span_ns)))
+    if not (rounded_ns.size and ascend(rounded_ns) and is_inside):
         end = span_ns / NANOSECONDS
-        _refuse(
-            "t_eval",
-            t_eval,
-            f"must be ascending times from 0 to {end:g} s, a nanosecond apart",
-        )
+        requirement = f"must be ascending times from 0 to {end:g} s, a nanosecond apart"
+        _refuse("t_eval", t_eval, requirement)
     return np.asarray(np.abs(rounded_ns) / NANOSECONDS)  # -0.0 is 0.0
+
+
+def _divide_evenly(samples: int | None, span_ns: int, period: int | None) -> Array:
+    """Return the ends of even intervals [s]: control periods, or a number of them."""
+    if samples is None and period is not None:
+        even_ns = np.append(np.arange(0, span_ns, period, dtype=np.int64), span_ns)
+    else:
+        count = _DEFAULT_SAMPLES if samples is None else samples
+        requirement = f"must be a whole number from 1 to {_MOST_SAMPLES}"
+        if not 1 <= count <= _MOST_SAMPLES:
+            _refuse("samples", samples, requirement)
+        even_ns = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
+    return np.asarray(even_ns / NANOSECONDS)

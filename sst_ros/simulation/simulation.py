@@ -58,11 +58,11 @@ EQUATIONS = ("quaternion", "virtual_work")
 """Equations of motion: in quaternion and body rate, or the paper's Eqs. 1 to 92."""
 
 _MOST_CALL_STEPS = 10**9
-"""Steps of one call."""
+"""Most steps of one call."""
 
-_COUNT = f"must be > 0 and <= {_MOST_CALL_STEPS:g}, a whole number"
-_THREE = "must be three finite numbers [N m]"
-_TORQUE_WORDS = f"{_THREE}, a SineTorque or a function of t [s]"
+_COUNT_REQUIREMENT = f"must be > 0 and <= {_MOST_CALL_STEPS:g}, a whole number"
+_MOMENT_REQUIREMENT = "must be three finite numbers [N m]"
+_TORQUE_REQUIREMENT = f"{_MOMENT_REQUIREMENT}, a SineTorque or a function of t [s]"
 
 _PLAIN_BUDGET = 3_000_000
 """Operations a step in plain Python may take: 0.12 s at 37 ns each, on a 3 GHz core."""
@@ -78,43 +78,40 @@ _VIRTUAL_WORK_BUDGET = 1000
 
 
 def default_budget(dynamics: Dynamics, equations: str) -> int:
-    """Return evaluations that keep a step below about 0.2 s.
+    """Return the evaluations that keep a step below about 0.2 s.
 
-    They are 5,000 to 12,000 in plain Python.
+    In plain Python they are 5,000 to 12,000, by the terms of the scene.
     """
     if equations == "virtual_work":
         return _VIRTUAL_WORK_BUDGET
     if llvmlite_version() is not None:
         return _COMPILED_BUDGET
-    return _PLAIN_BUDGET // (
-        len(recent_ode(dynamics, work=True).program.steps) + _STAGE_OPERATIONS
-    )
+    operations = len(recent_ode(dynamics, work=True).program.steps)
+    return _PLAIN_BUDGET // (operations + _STAGE_OPERATIONS)
 
 
 def _read_whole(value: Any) -> int:
     """Return a whole number below 2^63 of any type as int, 0 for anything else."""
+    if isinstance(value, (bool, np.timedelta64)):  # they convert, but are no number
+        return 0
     try:
-        is_duration = isinstance(value, (bool, np.timedelta64))
-        number = 0 if is_duration else operator.index(value)
+        number = operator.index(value)
     except TypeError:
         return 0
     return number if number < 2**63 else 0
 
 
-def _one_of(names: tuple[str, ...]) -> str:
+def _require_one_of(names: tuple[str, ...]) -> str:
     return "must be one of " + ", ".join(names)
 
 
 class _Instant(NamedTuple):
-    """What a state is made of, when it is asked for.
-
-    Torque and moment acted before it.
-    """
+    """What a state is made of, when it is asked for."""
 
     time_ns: int
     point: Point
-    torque: Torque = (0.0, 0.0, 0.0)
-    moment: tuple[float, ...] = ()
+    torque: Torque = (0.0, 0.0, 0.0)  # that acted until then
+    moment: tuple[float, ...] = ()  # alike
 
 
 class Simulation(Explained):
@@ -161,18 +158,22 @@ class Simulation(Explained):
         equations: str = "quaternion",
         step_budget: int | None = None,
     ) -> None:
-        explicit = not isinstance(METHODS.get(integrator), Rosenbrock)
+        is_integrator = integrator in INTEGRATORS
+        is_budget = step_budget is None or step_budget > 0
+        are_equations = equations in EQUATIONS
+        is_explicit = not isinstance(METHODS.get(integrator), Rosenbrock)
+        fits = is_explicit or equations != "virtual_work"
         refuse_unless(
             "simulation",
-            ("integrator", integrator, integrator in INTEGRATORS, _one_of(INTEGRATORS)),
+            ("integrator", integrator, is_integrator, _require_one_of(INTEGRATORS)),
             ("tolerance", tolerance, tolerance > 0.0, "must be > 0"),
-            ("step_budget", step_budget, step_budget is None or step_budget > 0,
-             "must be > 0"),
-            ("equations", equations, equations in EQUATIONS, _one_of(EQUATIONS)),
-            ("equations", equations, explicit or equations != "virtual_work",
-             "needs an explicit integrator"),
-        )  # fmt: skip
-        self.scene = scene = scene_of(scene)
+            ("step_budget", step_budget, is_budget, "must be > 0"),
+            ("equations", equations, are_equations, _require_one_of(EQUATIONS)),
+            ("equations", equations, fits, "needs an explicit integrator"),
+        )
+        scene = scene_of(scene)
+        self.scene = scene
+        # a copy is made with them
         self._settings = integrator, tolerance, equations
         self._running = threading.Lock()
         self._thread = 0  # that advances the simulation
@@ -249,16 +250,16 @@ class Simulation(Explained):
         constant_torque = finite_vector(torque)
         are_counted = length > 0 and 0 < number <= _MOST_CALL_STEPS
         if constant_torque is None or finite_vector(moment) is None or not are_counted:
-            # Each argument by itself, to name the one that is refused.
+            # Some argument is not plain: look at each, to name one that is refused.
             is_function = callable(torque) or isinstance(torque, TorqueProfile)
             is_torque = constant_torque is not None or is_function
             is_moment = finite_vector(moment) is not None
             refuse_unless(
                 "step",
-                ("torque", torque, is_torque, _TORQUE_WORDS),
-                ("moment", moment, is_moment, _THREE),
+                ("torque", torque, is_torque, _TORQUE_REQUIREMENT),
+                ("moment", moment, is_moment, _MOMENT_REQUIREMENT),
                 ("dt_ns", dt_ns, length > 0, "must be > 0, in whole nanoseconds"),
-                ("count", count, 0 < number <= _MOST_CALL_STEPS, _COUNT),
+                ("count", count, 0 < number <= _MOST_CALL_STEPS, _COUNT_REQUIREMENT),
             )
         if constant_torque is None:
             return self.acting(torque), length, number
@@ -289,19 +290,16 @@ class Simulation(Explained):
             return self._stepper.torque.acting(constant_torque)
         if not isinstance(torque, TorqueProfile):
             is_function = callable(torque) and count_arguments(torque) == 1
-            refuse_unless("step", ("torque", torque, is_function, _TORQUE_WORDS))
+            refuse_unless("step", ("torque", torque, is_function, _TORQUE_REQUIREMENT))
         return self._stepper.torque.acting(profile_of(torque))
 
     def advance(self, torque: Torque, dt_ns: int, count: int, moment: Vector3) -> None:
-        """Do what `steps` does, for arguments that have been checked.
-
-        Torque is of `acting`.
-        """
+        """Do what `steps` does, without checks: `torque` is what `acting` returns."""
         h = dt_ns / NANOSECONDS
         acting_moment: tuple[float, ...] = ()
         if self.dynamics.has_moment_topic:
             acting_moment = tuple(map(float, moment))
-        # One thread at a time: what follows reads where the run is, and moves it.
+        # One thread at a time: what follows reads where the run is, and changes it.
         self._claim()
         began = self._current
         try:
@@ -334,10 +332,9 @@ class Simulation(Explained):
 
     @check_kinds
     def within(self, time_ns: int) -> State:
-        """State at a time inside the last step, to the full accuracy of the run.
+        """Return the state at a time inside the last step, as accurate as the run.
 
-        It is stepped to from the beginning of that step, under the torques that were
-        given.
+        It is that of a step from the beginning of the last one, under the same torques.
 
         Raises:
             InputError: the time is not inside the last step.
@@ -390,10 +387,10 @@ class Simulation(Explained):
 
     @property
     def sample(self) -> tuple[Sequence[float], Sequence[float], Vector3]:
-        """Numbers of `state`.
+        """The numbers of `state`.
 
-        Quaternion and body rate come first, then nine angles and nine rates, then
-        torques.
+        They are those that are integrated, quaternion and body rate first; nine angles
+        and nine rates of the joints; and the torques.
         """
         instant = self._current
         return instant.point.y, instant.point.joints, self._torque(instant)
@@ -402,11 +399,13 @@ class Simulation(Explained):
     def body_acceleration(self) -> Vector3:
         """Angular acceleration of the star in {E} [rad/s^2].
 
-        That under the torques and the moment of the last step; the next one may have
-        others.
+        It is that under the torques and the moment of the last step; the next step may
+        have others.
         """
         instant = self._current
-        moment = (instant.moment or ZERO) if self.dynamics.has_moment_topic else ()
+        moment: tuple[float, ...] = ()
+        if self.dynamics.has_moment_topic:
+            moment = instant.moment or ZERO  # before the first step it has none
         state = instant.point.y[: len(self.dynamics.state)]
         slope = self.dynamics.derivative(*state, *self._torque(instant), *moment)
         return triple(slope[STAR_RATE])
@@ -423,7 +422,7 @@ class Simulation(Explained):
 
     @property
     def changes(self) -> list[MethodChange]:
-        """Changes of method that auto has made: time [s], method, reason."""
+        """Changes of method that auto has made."""
         return list(self._current.point.changes)
 
     @property
@@ -443,8 +442,8 @@ class Simulation(Explained):
     def error_estimate(self) -> float:
         """Estimated global error of the orientation [rad].
 
-        Twice the distance of a second solution, which takes steps of half the length:
-        it holds where the error only halves with the steps, too. Not less than
+        It is twice the distance of a second solution, whose steps have half the length,
+        so it holds where the error only halves with the steps, too. It is not less than
         rounding.
         """
         return self._current.point.error
@@ -463,17 +462,14 @@ class Simulation(Explained):
 
     @property
     def closure_residual(self) -> float:
-        """Largest abs(r_k . t_k): how far the loops are from closed."""
+        """Largest abs(r_k . t_k), 0 where the loops are exactly closed."""
         rotation = rotation_matrix(self.state.quaternion)
         closure = kinematics.closure(self.geometry, self.state.joints.gamma, rotation)
         return float(np.abs(closure).max())
 
     @property
     def conditioning(self) -> dict[str, float]:
-        """The least sin(mu_k), and det J2.
-
-        The first is zero at a serial singularity, the second at a parallel one.
-        """
+        """The least sin(mu_k) and det J2, see the function `conditioning`."""
         return conditioning(self.geometry, self.state)
 
     def _facts(self) -> dict[str, object]:
@@ -489,15 +485,12 @@ class Simulation(Explained):
         }
 
     def _as_state(self, instant: _Instant) -> State:
-        return State.of(
-            instant.time_ns,
-            instant.point.y,
-            instant.point.joints,
-            self._torque(instant),
-        )
+        point = instant.point
+        return State.of(instant.time_ns, point.y, point.joints, self._torque(instant))
 
     def _torque(self, instant: _Instant) -> Vector3:
-        # Constant torques act as they are; others are evaluated at the instant.
+        """Return the torques that the actuators give at an instant [N m]."""
+        # As held torques act at once without lag, nothing is to be evaluated.
         if type(instant.torque) is tuple and not self._lags:
             return instant.torque
         return self._stepper.acting(
@@ -508,7 +501,7 @@ class Simulation(Explained):
 def _continue_simulation(
     arguments: tuple[Any, ...], instants: tuple[_Instant, _Instant], spent: int
 ) -> Simulation:
-    """Make a simulation that goes on where another one was."""
+    """Make a copy of a simulation, for pickle."""
     scene, integrator, tolerance, equations, budget = arguments
     copied = Simulation(
         scene, integrator, tolerance=tolerance, equations=equations, step_budget=budget
@@ -519,9 +512,9 @@ def _continue_simulation(
 
 
 def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
-    """Return the least sin(mu_k), and det J2.
+    """Return the least sin(mu_k), which is zero at a serial singularity, and det J2.
 
-    The first is zero at a serial singularity, the second at a parallel one.
+    The latter is zero at a parallel singularity.
     """
     r = kinematics.carriage_directions(geometry, state.joints.gamma)
     rotation = rotation_matrix(state.quaternion)
@@ -534,6 +527,5 @@ def conditioning(geometry: Geometry, state: State) -> dict[str, float]:
 
 def describe_conditioning(geometry: Geometry, state: State) -> str:
     """Say how near a state is to a singularity."""
-    return ", ".join(
-        f"{name} = {x:.3g}" for name, x in conditioning(geometry, state).items()
-    )
+    values = conditioning(geometry, state)
+    return ", ".join(f"{name} = {value:.3g}" for name, value in values.items())

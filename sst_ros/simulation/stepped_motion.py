@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motion by steps with error control.
-
-It takes any torque, control periods, limits and stiff scenes.
-"""
+"""A run of a motion by steps with error control, and its samples."""
 
 from __future__ import annotations
 
@@ -33,12 +30,12 @@ from sst_ros.simulation.samples import Samples
 from sst_ros.state import MOMENT, NANOSECONDS, Array, State, Vector3, clamp
 
 _WARN_AFTER = 100_000
-"""Evaluations, a second of work where a function gives the torques, after which a
-motion is looked at that will not reach its end: a warning then, and not a stop after
-half a minute.
+"""Evaluations after which a motion warns if its budget will not do.
+
+Where a function gives the torques they take a second, and the budget half a minute.
 """
 _HOPELESS = 3.0
-"""...by so many times its budget."""
+"""Multiple of its budget that a motion needs which warns."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +101,13 @@ class SteppedMotion:
         self.held: list[tuple[float, Vector3]] = []
         self.samples = Samples(self.stepper)
         self._times: list[float] = task.times.tolist()
-        self._next = 0  # of the times that are not taken yet
+        self._next = 0  # place of the next time
         self._torque: Torque = (0.0, 0.0, 0.0)
         # on the second solution, where they differ
         self._second_torque: Vector3 | None = None
         self._segment = task.span
+        self._step: Step | None = None  # the last one
+        self._step_begin = task.span[0]  # time at which it begins [s]
         self._moment = (0.0,) * len(self.stepper.dynamics.drive[MOMENT])
         self._bar = Bar(f"{task.scene.name}, simulating", progress)
         self._spent_before = budget.spent
@@ -156,14 +155,16 @@ class SteppedMotion:
             self._advance(start, stop - start, stop, task.torque.piece(start, stop))
 
     def _hold_periods(self, period: int) -> None:
-        """Go through control periods, which hold the torques of a function."""
+        """Go through control periods [ns], which hold the torques of a function."""
         task = self._task
         end_ns = round(task.span[1] * NANOSECONDS)
         for start_ns in range(0, end_ns, period):
             time = start_ns / NANOSECONDS
             self._take_if_wanted(time, self.point.y)
-            state = (self.state(),) if task.torque.feedback else ()
-            torque = task.torque.at(time, *state)
+            if task.torque.feedback:
+                torque = task.torque.at(time, self.state())
+            else:
+                torque = task.torque.at(time)
             self.held.append((time, torque))
             if task.torque.feedback and task.memoryless:
                 self._second_torque = self._answer_second(time)
@@ -180,7 +181,7 @@ class SteppedMotion:
         return clamp(torque, self.stepper.torque.limit)
 
     def _advance(self, begin: float, h: float, end: float, torque: Torque) -> None:
-        """Go through a segment of length h under a torque, `begin` to `end` [s]."""
+        """Go through a segment of length h from `begin` to `end` [s] under a torque."""
         self._segment = begin, end
         self._torque = self.stepper.torque.acting(torque)
         self._take_if_wanted(begin, self.point.y)
@@ -189,13 +190,14 @@ class SteppedMotion:
 
     def _pass(self, step: Step) -> None:
         """Take the samples in a step, and note where the motion stands."""
-        self._last = step
-        self._last_begin = self._segment[0] + step.t
-        end = self._segment[1] if step.last else self._last_begin + step.h
+        segment_begin, segment_end = self._segment
+        self._step = step
+        self._step_begin = segment_begin + step.t
+        end = segment_end if step.last else self._step_begin + step.h
         times = self._times
         if self._next < len(times) and times[self._next] < end:
             first = self._next
-            self._next = bisect_left(times, end, self._next)
+            self._next = bisect_left(times, end, first)
             self._take_between(times[first : self._next])
         self.time = end
         self.point = step.end
@@ -208,10 +210,12 @@ class SteppedMotion:
 
     def _take_between(self, times: list[float]) -> None:
         """Take samples at ascending times in the last step [s]."""
-        step = self._last
-        begin = self._last_begin
+        step = self._step
+        begin = self._step_begin
+        assert step is not None
         if times[0] <= begin:  # the time of its begin, but for rounding
-            self._take(times.pop(0), step.begin.y)
+            self._take(times[0], step.begin.y)
+            times = times[1:]
         states = self._interpolate(step, [time - begin for time in times])
         if states is not None:
             for time, y in zip(times, states, strict=True):
@@ -220,26 +224,27 @@ class SteppedMotion:
             self.samples.add_inside(times, self._torque, step, begin)
 
     def _warn_if_hopeless(self, share: float) -> None:
-        """Warn once if the rest of the motion would far exceed the budget."""
+        """Warn once if the motion would far exceed its budget, `share` being done."""
         self._warn_after = math.inf
         most = self._budget.per_period
         spent = self._budget.spent - self._spent_before
         if _HOPELESS * most * share < spent:
-            progress_text = (
-                f"{spent:,} evaluations for {100.0 * share:.2g} % of the motion"
+            text = (
+                f"{self._task.scene.name}: {spent:,} evaluations for"
+                f" {100.0 * share:.2g} % of the motion; it stops at {most:,}: shorten"
+                " it, or change its method"
             )
-            advice = f"it stops at {most:,}: shorten it, or change its method"
-            text = f"{self._task.scene.name}: {progress_text}; {advice}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
 
     def _interpolate(self, step: Step, x: list[float]) -> list[list[float]] | None:
         """Return the states at times x after the begin of a step [s], by a polynomial.
 
-        None where a step for each costs less, and where the polynomial misses the state
-        by more than the tolerance, where its error is largest.
+        None where a step for each costs less, and where the polynomial misses a state
+        by more than the tolerance: the one where its error is largest.
         """
         steps = step.steps
-        if isinstance(steps, (MethodSteps, TimeSteps)):  # computed together, at the end
+        # The samples of compiled steps are computed together, at the end.
+        if isinstance(steps, (MethodSteps, TimeSteps)):
             return None
         cost = steps.interpolation_cost + steps.cost
         if cost > len(x) * steps.cost:
@@ -254,6 +259,7 @@ class SteppedMotion:
         return states if distance <= self._task.tolerance else None
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
+        """Take a sample at a time and a state if it is the next one."""
         if self._next < len(self._times) and self._times[self._next] == time:
             self._next += 1
             self._take(time, y)

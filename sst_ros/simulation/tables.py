@@ -31,35 +31,43 @@ def write_table(
 ) -> None:
     """Write columns of equal length, shape (n,), whole numbers or doubles.
 
-    The suffix of the path, one of SUFFIXES, says what the file is. Parquet keeps texts
-    about each column, as its unit, and about the table, NPZ the latter; nan is no value
-    in Parquet and CSV, which need pyarrow and pandas.
+    The suffix of the path, one of SUFFIXES, gives the form of the file. Parquet keeps
+    `about`, texts about each column such as its unit, and `texts` about the table; NPZ
+    keeps the latter. In Parquet and CSV, which need pyarrow and pandas, nan is a
+    missing value.
     """
     texts = dict(texts or {})
     texts[_CHECKSUM] = compute_checksum(texts, columns)
-    with replace_file(path) as own:
+    with replace_file(path) as file_path:
         if path.suffix == ".npz":
-            named: dict[str, Any] = {**columns, **texts}
-            with own.open("wb") as file:
-                np.savez(file, **named)
+            entries: dict[str, Any] = {**columns, **texts}
+            with file_path.open("wb") as file:
+                np.savez(file, **entries)
         elif path.suffix == ".csv":
             # pandas writes the fewest digits that read back as the same bits.
-            require("pandas").DataFrame(columns).to_csv(
-                own, index=False, lineterminator="\n"
-            )
+            frame = require("pandas").DataFrame(columns)
+            frame.to_csv(file_path, index=False, lineterminator="\n")
         else:
-            pyarrow, parquet = require("pyarrow"), require("pyarrow.parquet")
-            arrays = [
-                pyarrow.array(column, from_pandas=True) for column in columns.values()
-            ]
-            fields = [
-                pyarrow.field(name, array.type, metadata=about[name])
-                for name, array in zip(columns, arrays, strict=True)
-            ]
-            table = pyarrow.Table.from_arrays(
-                arrays, schema=pyarrow.schema(fields, texts)
-            )
-            parquet.write_table(table, own, write_page_checksum=True)
+            _write_parquet(columns, file_path, about, texts)
+
+
+def _write_parquet(
+    columns: Mapping[str, NDArray[Any]],
+    path: Path,
+    about: Mapping[str, Mapping[str, str]],
+    texts: Mapping[str, str],
+) -> None:
+    pyarrow = require("pyarrow")
+    parquet = require("pyarrow.parquet")
+    arrays = []
+    fields = []
+    for name, column in columns.items():
+        array = pyarrow.array(column, from_pandas=True)
+        arrays.append(array)
+        fields.append(pyarrow.field(name, array.type, metadata=about[name]))
+    schema = pyarrow.schema(fields, texts)
+    table = pyarrow.Table.from_arrays(arrays, schema=schema)
+    parquet.write_table(table, path, write_page_checksum=True)
 
 
 def load_table(
@@ -114,7 +122,7 @@ def _read_npz(
 def compute_checksum(
     texts: Mapping[str, str], columns: Mapping[str, NDArray[Any]]
 ) -> str:
-    """CRC-32 of texts and of the bits of columns."""
+    """Return the CRC-32 of texts and of the bits of columns, in hexadecimal."""
     checksum = zlib.crc32("".join(texts.values()).encode())
     for column in columns.values():
         checksum = zlib.crc32(np.ascontiguousarray(column).data, checksum)

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from sst_ros.dynamics import kernel
 from sst_ros.dynamics.motion_table import JOINT_QUANTITIES, MotionTable
 from sst_ros.dynamics.reactions import REACTION_UNITS, Reactions, reactions_of
-from sst_ros.dynamics.traced_dynamics import Dynamics
+from sst_ros.dynamics.traced_dynamics import STATE_SIZE, Dynamics
 from sst_ros.dynamics.variational import Sensitivities, Sensitivity
 from sst_ros.errors import (
     Check,
@@ -53,6 +53,7 @@ from sst_ros.simulation.stepped_motion import SteppedMotion, Task
 from sst_ros.simulation.tables import SUFFIXES, load_table, write_table
 from sst_ros.state import (
     DIMENSIONS,
+    JOINT_COUNT,
     LAGGED_TORQUES,
     MOTION_UNITS,
     QUANTITIES,
@@ -68,39 +69,19 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-_KEY = "sst_ros"
-"""Of the text in a file that holds what is no column."""
+_METADATA_KEY = "sst_ros"
+"""Key of the text in a file about the motion as a whole."""
 _FORMAT = 1
 """Number of the form of that text; a file of another form is refused."""
-_ACCURACY = 1e-13
-"""Error of a step between samples; gaps are short, so that steps do not add up."""
-
-
+_LOADABLE = "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
+_BETWEEN_SAMPLES = 1e-13
+"""Tolerance of a step between samples: there are few, so their errors do not add up."""
 _UNIT_DEVIATION = 1e-6
 """Largest deviation of the length of a quaternion from 1 in a file."""
 _CLOSURE = 0.02
 """Largest abs(r_k . t_k) in a file. A simulated motion has 1e-15; a recorded one has
 the noise of its encoders. What exceeds this is the orientation of another motion.
 """
-
-
-def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
-    """Refuse columns of a file that are no numbers, not finite or unequally long."""
-    count = columns["t"].shape
-    for name, column in columns.items():
-        number = column.dtype.kind in "fiu"
-        refuse_unless(
-            f"load: {path}",
-            (name, str(column.dtype), number, "must be numbers"),
-            (name, column.shape, column.shape == count, f"must have the shape {count}"),
-            (
-                name,
-                "nan",
-                not number or bool(np.isfinite(column).all()),
-                "must be finite",
-            ),
-        )
-
 
 _STATUSES = (-1, 0, 1, 2)
 _UNMET = 2
@@ -126,12 +107,13 @@ class RunRecord:
         law: torques that act between the samples, for `Trajectory.at`, as `simulate`
             takes them; by default each is held over the interval that ends at its
             sample.
-        parameters: numbers of the scene, its start or its torques that
-            `Trajectory.sensitivities` are by.
+        parameters: numbers of the scene, its start or its torques by which
+            `Trajectory.sensitivities` differentiates.
         ends: states at the start and at the end of the run, in each the work done until
             then [J] as the last number.
-        dense: a function from times (m,) [s] to states (m, 7 or 10) that
-            `Trajectory.at` uses in place of the law. Copies do not have it.
+        dense: a function from times [s], shape (m,), to states, shape (m, 7), or (m,
+            10) with the torques, which `Trajectory.at` uses in place of the law. Copies
+            do not have it.
 
     Raises:
         InputError: the status is none of these.
@@ -172,7 +154,7 @@ FIGURES = (
 """What a run says of itself in files and in xarray."""
 
 _TEXTS = ("message", "method")
-"""Those of the figures that are text; the others are numbers."""
+"""Figures that are text; the others are numbers."""
 
 
 def read_figures(document: dict[str, Any]) -> dict[str, Any]:
@@ -208,10 +190,8 @@ def check_error(
     """Return status and message of a motion with an error estimate at its end [rad]."""
     if not error > tolerance:
         return status, message
-    unmet = (
-        f"the error estimate {error:.1e} rad exceeds the tolerance {tolerance:g} rad"
-    )
-    return status or _UNMET, f"{message}; {unmet}"
+    unmet = f"the error estimate {error:.1e} rad exceeds"
+    return status or _UNMET, f"{message}; {unmet} the tolerance {tolerance:g} rad"
 
 
 class Trajectory(MotionTable):
@@ -254,26 +234,21 @@ class Trajectory(MotionTable):
         self.quaternion = _own("quaternion", quaternion)
         self.body_rate = _own("body_rate", body_rate)
         self.torque = _own("torque", torque)
-        self.gaps = _own("gaps", np.empty((0, 2)) if np.size(gaps) == 0 else gaps)
+        if np.size(gaps) == 0:
+            gaps = np.empty((0, 2))
+        self.gaps = _own("gaps", gaps)
         sizes = {"quaternion": 4, "body_rate": 3, "torque": 3}
         if joints is not None:
             self._joints = _own("joints", joints)
-            sizes["_joints"] = 18
-        rising = (
-            self.gaps.ndim == 2
-            and self.gaps.shape[1] == 2
-            and ascend(self.gaps.ravel())
-        )
+            sizes["_joints"] = 2 * JOINT_COUNT
+        are_pairs = self.gaps.ndim == 2 and self.gaps.shape[1] == 2
+        are_spans = are_pairs and ascend(self.gaps.ravel())
+        spans_requirement = "must be rising pairs of times [s], shape (g, 2)"
         checks: list[Check] = [
             ("scene", scene, isinstance(scene, Scene), "must be a Scene"),
             ("run", run, isinstance(run, RunRecord), "must be a RunRecord"),
             ("t", t, ascend(self.t), "must be finite, ascending times [s], shape (n,)"),
-            (
-                "gaps",
-                gaps,
-                rising,
-                "must be rising pairs of times [s], shape (g, 2)",
-            ),
+            ("gaps", gaps, are_spans, spans_requirement),
         ]
         for name, size in sizes.items():
             shape = vars(self)[name].shape
@@ -285,17 +260,12 @@ class Trajectory(MotionTable):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a copy or a pickle, also of a version without records."""
         if "run" not in state:
-            arrays = (
-                "scene",
-                "t",
-                "quaternion",
-                "body_rate",
-                "torque",
-                "gaps",
-                "_joints",
-            )
-            kept = {name: state[name] for name in arrays if name in state}
-            state = {**kept, "run": record_of_pickle(state)}
+            record = record_of_pickle(state)
+            names = (
+                "scene", "t", "quaternion", "body_rate", "torque", "gaps", "_joints",
+            )  # fmt: skip
+            state = {name: state[name] for name in names if name in state}
+            state["run"] = record
         super().__setstate__(state)
 
     @property
@@ -354,8 +324,8 @@ class Trajectory(MotionTable):
     def gamma_ddot(self) -> Array:
         """Accelerations of the actuators [rad/s^2], shape (n, 3).
 
-        They are those under `torque` and the scene's loads. A moment from a topic is no
-        part of them.
+        They are those under `torque` and the scene's loads, without a moment from a
+        topic.
         """
         model = self._dynamics.model._replace(time_constant=None)
         y = self._columns
@@ -371,8 +341,8 @@ class Trajectory(MotionTable):
     def reactions(self) -> Reactions:
         """Forces and moments at every joint, see `Reactions`.
 
-        They are those under `torque` and the scene's loads. A moment from a topic is no
-        part of them.
+        They are those under `torque` and the scene's loads, without a moment from a
+        topic.
         """
         reactions = reactions_of(
             self.scene, self.t, self.quaternion, self.body_rate, self.torque
@@ -390,41 +360,40 @@ class Trajectory(MotionTable):
         with np.errstate(all="ignore"):
             model = self._dynamics.model
             columns = self._columns
-            total = kernel.kinetic_energy(model, columns) + kernel.potential_energy(
-                model, columns
-            )
-        return freeze(np.broadcast_to(total, self.t.shape))
+            kinetic = kernel.kinetic_energy(model, columns)
+            potential = kernel.potential_energy(model, columns)
+        return freeze(np.broadcast_to(kinetic + potential, self.t.shape))
 
     @cached_property
     def energy_residual(self) -> float:
         """Energy at the end, less that at the start, less the work done [J].
 
-        Nan if unknown.
+        It is nan if unknown.
         """
         if self.run.ends is None:
             return self.run.energy_residual
         start, end = self.run.ends
+        work = end[-1]
         energy = self._dynamics.total_energy
-        return energy(end) - energy(start) - end[-1]
+        return energy(end) - energy(start) - work
 
     @cached_property
     def closure_error(self) -> float:
-        """Largest abs(r_k . t_k) of all samples: how far the loops are from closed.
-
-        0 if exact.
-        """
+        """Largest abs(r_k . t_k) of all samples, 0 if the loops are exactly closed."""
         rotation = rotation_matrix(self.quaternion)
         geometry = Geometry.of(self.scene)
-        return float(
-            np.abs(kinematics.closure(geometry, self.gamma, rotation)).max(initial=0.0)
-        )
+        closure = kinematics.closure(geometry, self.gamma, rotation)
+        return float(np.abs(closure).max(initial=0.0))
 
     @cached_property
     def sensitivities(self) -> dict[str, Sensitivity]:
         """Derivatives of the samples by each parameter given to `simulate`, by name.
 
-        They are computed when they are first asked for. Raises InputError: no motion is
-        found.
+        They are computed when they are first asked for.
+
+        Raises:
+            InputError: a parameter does not fit the scene or the torques.
+
         """
         if not self.run.parameters or self.law is None:
             return {}
@@ -454,19 +423,19 @@ class Trajectory(MotionTable):
 
         """
         times = np.atleast_1d(read_numbers("at", "t", t, seconds=True))
-        inside = (times >= self.t[0]) & (times <= self.t[-1])
-        fits = times.ndim == 1 and times.size > 0 and bool(np.all(inside))
-        requirement = (
-            f"must be times from {self.t[0]:g} to {self.t[-1]:g} s, shape (m,)"
-        )
+        first = self.t[0]
+        last = self.t[-1]
+        inside = bool(np.all((times >= first) & (times <= last)))
+        fits = times.ndim == 1 and times.size > 0 and inside
+        requirement = f"must be times from {first:g} to {last:g} s, shape (m,)"
         refuse_unless("at", ("t", t, fits, requirement))
-        can_propagate = not isinstance(self.law, LostTorque) or bool(
-            np.all(np.isin(times, self.t))
-        )
-        requirement = (
-            "must be times of samples: the function of the torques is not in the file"
-        )
-        refuse_unless("at", ("t", t, can_propagate, requirement))
+        if isinstance(self.law, LostTorque):
+            are_samples = bool(np.all(np.isin(times, self.t)))
+            requirement = (
+                "must be times of samples:"
+                " the function of the torques is not in the file"
+            )
+            refuse_unless("at", ("t", t, are_samples, requirement))
         for begin, end in self.gaps.tolist():
             outside = not np.any((times > begin) & (times < end))
             requirement = f"nothing is known of the motion from {begin:g} to {end:g} s"
@@ -485,12 +454,13 @@ class Trajectory(MotionTable):
     def __getitem__(self, rows: slice) -> Trajectory:
         """Return the samples of a slice, as in `motion[::10]`.
 
-        InputError: it is none, or empty.
+        Raises:
+            InputError: it is no slice, or has no samples.
+
         """
-        chosen = isinstance(rows, slice) and len(self.t[rows])
-        refuse_unless(
-            "trajectory", ("rows", rows, bool(chosen), "must be a slice with samples")
-        )
+        fits = isinstance(rows, slice) and len(self.t[rows]) > 0
+        requirement = "must be a slice with samples"
+        refuse_unless("trajectory", ("rows", rows, fits, requirement))
         return Trajectory(
             self.scene,
             self.t[rows],
@@ -503,7 +473,7 @@ class Trajectory(MotionTable):
         )
 
     def to_pandas(self, *, reactions: bool = False) -> pd.DataFrame:
-        """Table with a row an instant, a column a number, units in its `attrs`.
+        """Return a table: a row an instant, a column a number, units in its `attrs`.
 
         With `reactions` the columns of `Reactions.columns` follow.
         """
@@ -536,23 +506,21 @@ class Trajectory(MotionTable):
 
         """
         path = Path(path)
-        ends = f"must end in {' or '.join(SUFFIXES)}"
-        free = overwrite or not os.path.exists(path)  # noqa: PTH110  # Path's raises on long names
+        has_suffix = path.suffix in SUFFIXES
+        suffixes = f"must end in {' or '.join(SUFFIXES)}"
+        # `exists` of a Path raises on long names
+        is_free = overwrite or not os.path.exists(path)  # noqa: PTH110
+        fits = not reactions or path.suffix == ".csv"
         refuse_unless(
             "save",
-            ("path", str(path), path.suffix in SUFFIXES, ends),
-            ("path", str(path), free, "exists; overwrite=True replaces it"),
-            (
-                "reactions",
-                True,
-                not reactions or path.suffix == ".csv",
-                "is for .csv alone",
-            ),
+            ("path", str(path), has_suffix, suffixes),
+            ("path", str(path), is_free, "exists; overwrite=True replaces it"),
+            ("reactions", True, fits, "is for .csv alone"),
         )
         about = self._of_run() | {
             "format": _FORMAT,
             "scene": dump(self.scene),
-            "torque": self.law and self.law.record(),
+            "torque": None if self.law is None else self.law.record(),
             "gaps": self.gaps.tolist(),
         }
         units = {name: {"unit": unit} for name, unit in MOTION_UNITS.items()}
@@ -560,7 +528,7 @@ class Trajectory(MotionTable):
         if reactions:
             columns |= self.reactions.columns()
         with refuse_errors("save", "path", str(path), "must be writable", OSError):
-            write_table(columns, path, units, {_KEY: json.dumps(about)})
+            write_table(columns, path, units, {_METADATA_KEY: json.dumps(about)})
 
     @classmethod
     @check_kinds
@@ -572,27 +540,24 @@ class Trajectory(MotionTable):
             MissingDependency: pyarrow (.parquet) is not installed.
 
         """
-        requirement = (
-            "must be a trajectory that `Trajectory.save` has written as Parquet or NPZ"
-        )
         try:
-            columns, texts = load_table(Path(path), list(MOTION_UNITS), [_KEY])
-            about = json.loads(texts[_KEY])
+            names = list(MOTION_UNITS)
+            columns, texts = load_table(Path(path), names, [_METADATA_KEY])
+            about = json.loads(texts[_METADATA_KEY])
         except (KeyError, ValueError, RecursionError) as error:
             reason = "" if isinstance(error, KeyError) else f" ({error})"
-            raise refusal("load", "path", str(path), requirement + reason) from None
+            raise refusal("load", "path", str(path), _LOADABLE + reason) from None
         form = about.get("format") if isinstance(about, dict) else None
         refuse_unless("load", ("format", form, form == _FORMAT, f"must be {_FORMAT}"))
         _check_columns(path, columns)
-        arrays = {
-            name: np.stack(
-                [columns[f"{name}_{component}"] for component in DIMENSIONS[dimension]],
-                axis=1,
-            )
-            for name, (_, dimension) in QUANTITIES.items()
-        }
+        arrays = {}
+        for name, (_, dimension) in QUANTITIES.items():
+            components = [columns[f"{name}_{part}"] for part in DIMENSIONS[dimension]]
+            arrays[name] = np.stack(components, axis=1)
         try:
-            law = about["torque"] and profile_from(about["torque"])
+            law = about["torque"]
+            if law:
+                law = profile_from(law)
             motion = cls(
                 read(Scene, about["scene"], str(path)),
                 columns["t"],
@@ -605,24 +570,8 @@ class Trajectory(MotionTable):
             )
         except (TypeError, ValueError, LookupError, AttributeError) as error:
             reason = f" (its metadata: {type(error).__name__}: {error})"
-            raise refusal("load", "path", str(path), requirement + reason) from None
-        lengths = np.linalg.norm(motion.quaternion, axis=1)
-        off = float(np.abs(lengths - 1.0).max(initial=0.0))
-        refuse_unless(
-            "load",
-            (
-                "quaternion",
-                off,
-                off <= _UNIT_DEVIATION,
-                f"must be of length 1 to {_UNIT_DEVIATION:g}",
-            ),
-            (
-                "quaternion",
-                motion.closure_error,
-                motion.closure_error <= _CLOSURE,
-                f"must close the loops with gamma: abs(r_k . t_k) <= {_CLOSURE:g}",
-            ),
-        )
+            raise refusal("load", "path", str(path), _LOADABLE + reason) from None
+        _check_orientations(motion)
         return motion
 
     def _of_run(self) -> dict[str, Any]:
@@ -644,11 +593,10 @@ class Trajectory(MotionTable):
         kinks = law.kinks()
         inside = kinks[(kinks > self.t[0]) & (kinks < self.t[-1])]
         times = np.sort(np.concatenate([self.t, inside, inside]))
-        # Of the two points at a step the first is of before it.
-        first = np.append(times[1:] == times[:-1], False)
-        acting = np.where(first, np.nextafter(times, -np.inf), times)
-        limit = self.scene.torque_limit or np.inf
-        return np.clip(law.values(acting), -limit, limit), times
+        # Of the two points at a step the first has the torque before it.
+        is_first = np.append(times[1:] == times[:-1], False)
+        acting_times = np.where(is_first, np.nextafter(times, -np.inf), times)
+        return _clip_torques(self, law, acting_times), times
 
     def plot(self) -> Figure:
         """Draw actuator angles, rates, torques and the energy of the samples.
@@ -670,12 +618,11 @@ class Trajectory(MotionTable):
         return figure
 
     def _facts(self) -> dict[str, object]:
+        span = f"{self.t[0]:g} to {self.t[-1]:g}" if len(self) else "no samples"
         return {
             "scene": self.scene.name,
             "samples": len(self),
-            "time [s]": (
-                f"{self.t[0]:g} to {self.t[-1]:g}" if len(self) else "no samples"
-            ),
+            "time [s]": span,
             "status": f"{self.status}: {self.message}",
             "method": self.method,
             "error estimate [rad]": self.error_estimate,
@@ -688,12 +635,50 @@ class Trajectory(MotionTable):
             from sst_ros.figures import encode
 
             svg = encode(figure, "svg").decode()
-        return super()._repr_html_() + svg[max(svg.find("<svg"), 0) :]
+        without_header = svg[max(svg.find("<svg"), 0) :]
+        return super()._repr_html_() + without_header
 
 
 def _own(name: str, value: TimesLike) -> Array:
-    """Return an array that nothing can change, of times in seconds where it is `t`."""
+    """Return an argument as a read-only array; `t` may be durations."""
     return freeze(read_numbers("trajectory", name, value, seconds=name == "t"))
+
+
+def _check_columns(path: str | Path, columns: dict[str, Array]) -> None:
+    """Refuse columns of a file that are no numbers, not finite or unequally long."""
+    shape = columns["t"].shape
+    for name, column in columns.items():
+        are_numbers = column.dtype.kind in "fiu"
+        are_finite = not are_numbers or bool(np.isfinite(column).all())
+        fits = column.shape == shape
+        refuse_unless(
+            f"load: {path}",
+            (name, str(column.dtype), are_numbers, "must be numbers"),
+            (name, column.shape, fits, f"must have the shape {shape}"),
+            (name, "nan", are_finite, "must be finite"),
+        )
+
+
+def _check_orientations(motion: Trajectory) -> None:
+    """Refuse orientations of a file that are none, or those of another motion."""
+    lengths = np.linalg.norm(motion.quaternion, axis=1)
+    deviation = float(np.abs(lengths - 1.0).max(initial=0.0))
+    is_unit = deviation <= _UNIT_DEVIATION
+    unit = f"must be of length 1 to {_UNIT_DEVIATION:g}"
+    opening = motion.closure_error
+    is_closed = opening <= _CLOSURE
+    closed = f"must close the loops with gamma: abs(r_k . t_k) <= {_CLOSURE:g}"
+    refuse_unless(
+        "load",
+        ("quaternion", deviation, is_unit, unit),
+        ("quaternion", opening, is_closed, closed),
+    )
+
+
+def _clip_torques(trajectory: Trajectory, law: TorqueProfile, times: Array) -> Array:
+    """Return the torques of a law at times [s], within the limit of the actuators."""
+    limit = trajectory.scene.torque_limit or np.inf
+    return np.asarray(np.clip(law.values(times), -limit, limit))
 
 
 def _propagate(trajectory: Trajectory, times: Array) -> Array:
@@ -703,10 +688,10 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
     """
     if trajectory.run.dense is not None:
         states = trajectory.run.dense(times)
-        if states.shape[1] > 7 or trajectory.law is None:
+        has_torques = states.shape[1] > STATE_SIZE
+        if has_torques or trajectory.law is None:
             return states
-        limit = trajectory.scene.torque_limit or np.inf
-        return np.hstack([states, np.clip(trajectory.law.values(times), -limit, limit)])
+        return np.hstack([states, _clip_torques(trajectory, trajectory.law, times)])
     t = trajectory.t
     size = len(trajectory._dynamics.state)
     samples = np.hstack(
@@ -714,12 +699,18 @@ def _propagate(trajectory: Trajectory, times: Array) -> Array:
     )
     before = np.searchsorted(t, times, side="right") - 1
     propagated = samples[before]
+    # One run from each sample behind which states are asked for.
     for k in np.unique(before[times > t[before]]):
         rows = np.flatnonzero((before == k) & (times > t[k]))
         distinct_times, places = np.unique(times[rows], return_inverse=True)
-        law = trajectory.law or profile_of(trajectory.torque[k + 1])
-        span = float(t[k]), float(distinct_times[-1])
-        task = Task(trajectory.scene, law, span, distinct_times, DOP853.name, _ACCURACY)
+        task = Task(
+            scene=trajectory.scene,
+            torque=trajectory.law or profile_of(trajectory.torque[k + 1]),
+            span=(float(t[k]), float(distinct_times[-1])),
+            times=distinct_times,
+            method=DOP853.name,
+            tolerance=_BETWEEN_SAMPLES,
+        )
         budget = EvaluationBudget(WHOLE_MOTION_BUDGET, whole_run=True)
         motion = SteppedMotion(task, samples[k, :size], budget, limits=False).run()
         if motion.status:

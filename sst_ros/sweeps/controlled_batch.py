@@ -28,7 +28,13 @@ from sst_ros.control.controller import SETTLING_BAND, Controller
 from sst_ros.dynamics import kernel
 from sst_ros.errors import refuse_unless
 from sst_ros.integration.batch import Batch, BatchResult, block_width
-from sst_ros.integration.batch_step import Block, ColumnStep, advance_blocks, fill
+from sst_ros.integration.batch_step import (
+    Block,
+    Columns,
+    ColumnStep,
+    advance_blocks,
+    fill,
+)
 from sst_ros.mechanism.generic_math import axpy, cos, dot3, log, positive, select, sqrt
 from sst_ros.mechanism.geometry import Array, Geometry
 from sst_ros.programs.columns import ColumnFunction, compile_columns
@@ -144,21 +150,20 @@ class ControlledBlock(Block):
             for which in (0, 1)
         ]
 
-    def load(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
+    def load(self, columns_of_block: slice, columns: Columns) -> None:
         """Take over columns, their memory, gains and noise too."""
-        super().load(columns_of_block, *columns)
+        super().load(columns_of_block, columns)
         fill(self._memory, self._feedback.memory[:, columns_of_block])
         fill(self._gains, self._feedback.gains[:, columns_of_block])
         if len(self._uniform):
             fill(self._starts, self._feedback.starts[None, columns_of_block])
 
-    def store(self, columns_of_block: slice, *columns: NDArray[Any]) -> None:
+    def store(self, columns_of_block: slice, columns: Columns) -> None:
         """Put states, errors, torques and memory back."""
-        super().store(columns_of_block, *columns)
-        _, drives, code, *_ = columns
+        super().store(columns_of_block, columns)
         memory = self._feedback.memory
-        number = len(code[columns_of_block])  # the last block may have fewer
-        drives[TORQUES, columns_of_block] = self.given[TORQUES, :number]
+        number = len(columns.code[columns_of_block])  # the last block may have fewer
+        columns.drives[TORQUES, columns_of_block] = self.given[TORQUES, :number]
         memory[:, columns_of_block] = self._memory[:, :number]
 
     def prepare_step(self, number: int) -> None:
