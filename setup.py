@@ -68,7 +68,7 @@ EXTRAS |= {
     ],
     "engines": ["mujoco>=4", "pin>=4"],
     "peers": ["casadi>=3.6.5", "cmeel-eigen", "mpmath", "mujoco>=4", "pin>=4"],
-    # Not in `test`: colcon would measure coverage, in ten times the time.
+    # Not in `test`: colcon would measure coverage, and take many times as long.
     "coverage": ["pytest-cov"],
     "test": [
         "argcomplete",

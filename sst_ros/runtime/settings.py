@@ -40,7 +40,7 @@ class NodeParameters(Section):
 class SimulatorParameters(NodeParameters):
     """Parameters of sst_simulator."""
 
-    CHANGEABLE: ClassVar = (
+    CHANGEABLE: ClassVar[tuple[str, ...]] = (
         "real_time_factor",
         "command_timeout",
         "lockstep_timeout",
@@ -328,7 +328,7 @@ class PlayerParameters(AnsweringParameters):
 class ControllerNodeParameters(AnsweringParameters, ControllerSettings):
     """Parameters of sst_inverse_dynamics: those of the control law and of the node."""
 
-    CHANGEABLE: ClassVar = (
+    CHANGEABLE: ClassVar[tuple[str, ...]] = (
         "bandwidth",
         "damping_ratio",
         "stiffness",
