@@ -269,6 +269,15 @@ def test_a_torque_moves_as_its_function_does(scene, torque, within):
     )
 
 
+def test_a_state_within_many_steps_takes_the_budget_of_each():
+    simulation = Simulation(EXAMPLE2, step_budget=300)
+    simulation.steps(EXAMPLE2.torque, 10 * MILLISECOND, 50)
+    there = Simulation(EXAMPLE2)
+    there.steps(EXAMPLE2.torque, 10 * MILLISECOND, 49)
+    there.step(EXAMPLE2.torque, 6 * MILLISECOND)
+    assert simulation.within(there.time_ns).quaternion == there.state.quaternion
+
+
 BITS = """
 import json, sys
 if %s:

@@ -22,8 +22,6 @@ _STEP_ROUNDING = 8.0 * sys.float_info.epsilon
 
 PAIR_STEPS = 3
 """Steps that both solutions take over one step: one of its length, two of the half."""
-TWO_DRIVE_PAIR_STEPS = 6
-"""Steps that are counted for it where each solution has a drive of its own."""
 
 
 class MethodChange(NamedTuple):
@@ -150,7 +148,7 @@ class Step(NamedTuple):
     def cost(self) -> int:
         """Evaluations of both solutions."""
         cost: int = self.steps.cost
-        return cost * (PAIR_STEPS if self.other is None else TWO_DRIVE_PAIR_STEPS)
+        return PAIR_STEPS * cost
 
     def inside(self, x: float) -> list[float]:
         """Return the state x [s] after its begin, by a shorter step.

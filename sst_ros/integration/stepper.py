@@ -66,7 +66,6 @@ from sst_ros.integration.methods import (
 )
 from sst_ros.integration.point import (
     PAIR_STEPS,
-    TWO_DRIVE_PAIR_STEPS,
     Drive,
     Drives,
     MethodChange,
@@ -405,7 +404,6 @@ class Stepper:
         times just before and after it, at which steps end.
         """
         drive, second = drives
-        pair_steps = PAIR_STEPS if second is None else TWO_DRIVE_PAIR_STEPS
         rejected = 0
         leaps = 0
         looks = 0
@@ -413,7 +411,7 @@ class Stepper:
             if steps.method is not point.method:
                 steps = self._steps_of(drive, point.method)
             h = self._length_of(point, t, end, stops)
-            self.budget.charge(pair_steps * steps.cost)
+            self.budget.charge(PAIR_STEPS * steps.cost)
             after, size, stages = steps.pair(t, h, point, drive, second)
             error = size / self._tolerance
             if size <= self._tolerance:

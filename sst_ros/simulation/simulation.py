@@ -112,6 +112,7 @@ class _Instant(NamedTuple):
     point: Point
     torque: Torque = (0.0, 0.0, 0.0)  # that acted until then
     moment: tuple[float, ...] = ()  # alike
+    period_ns: int = 0  # length of the steps that led to it
 
 
 class Simulation(Explained):
@@ -316,7 +317,7 @@ class Simulation(Explained):
                 # What it reached is the state now; until here nothing has changed.
                 self._before = began
                 self._current = _Instant(
-                    instant.time_ns + dt_ns, point, torque, acting_moment
+                    instant.time_ns + dt_ns, point, torque, acting_moment, dt_ns
                 )
         finally:
             self._running.release()
@@ -334,10 +335,13 @@ class Simulation(Explained):
     def within(self, time_ns: int) -> State:
         """Return the state at a time inside the last step, as accurate as the run.
 
-        It is that of a step from the beginning of the last one, under the same torques.
+        It is that of a step from the beginning of the last one, under the same torques;
+        after a call of `steps`, that of its steps up to there.
 
         Raises:
             InputError: the time is not inside the last step.
+            StrokeExceeded, WorkspaceLeft, SingularityReached, StepBudgetExceeded,
+                Diverged: a shorter step meets what the last one passed.
 
         """
         began, end = self._before.time_ns, self._current.time_ns
@@ -347,12 +351,15 @@ class Simulation(Explained):
         )
         if time_ns == began:
             return self._as_state(self._before)
-        start = began / NANOSECONDS
-        h = (time_ns - began) / NANOSECONDS
-        torque = self._current.torque
-        moment = self._current.moment
-        period = Period(start, h, torque, moment)
-        point = self._stepper.advance(self._before.point, period)
+        _, _, torque, moment, period_ns = self._current
+        point = self._before.point
+        for start_ns in range(began, time_ns, period_ns):
+            start = start_ns / NANOSECONDS
+            h = min(period_ns, time_ns - start_ns) / NANOSECONDS
+            try:
+                point = self._stepper.advance(point, Period(start, h, torque, moment))
+            except (LimitReached, CannotStep) as stop:
+                raise self._explain(stop, start) from None
         return self._as_state(_Instant(time_ns, point, torque, moment))
 
     def reset(self) -> State:
