@@ -623,7 +623,8 @@ def _prepare(path: Path, folder: Path) -> tuple[Path, str]:
     return path, "db3" if is_database else "mcap"
 
 
-_SQLITE_HEADER_BYTES = 100
+# Magic, bytes of a page, changes of the file, pages, changes when these were counted.
+_SQLITE_HEADER = struct.Struct(">16sH6x4sL60x4s4x")
 _LARGEST_PAGE = 65536  # which the header writes as 1
 
 
@@ -638,16 +639,13 @@ def _check_pages(path: Path) -> None:
 
     """
     with path.open("rb") as file:
-        header = file.read(_SQLITE_HEADER_BYTES)
-    page_bytes = int.from_bytes(header[16:18], "big")
+        header = file.read(_SQLITE_HEADER.size)
+    if len(header) < _SQLITE_HEADER.size:
+        return
+    magic, page_bytes, changes, pages, counted_at = _SQLITE_HEADER.unpack(header)
     if page_bytes == 1:
         page_bytes = _LARGEST_PAGE
-    pages = int.from_bytes(header[28:32], "big")
-    changes = header[24:28]
-    changes_when_counted = header[92:96]
-    is_counted = header.startswith(b"SQLite format 3\0") and (
-        changes == changes_when_counted
-    )
+    is_counted = magic == _SQLITE_MAGIC and changes == counted_at
     expected_bytes = pages * page_bytes
     file_bytes = path.stat().st_size
     if is_counted and file_bytes < expected_bytes:
