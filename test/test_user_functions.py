@@ -184,3 +184,15 @@ def test_a_new_process_needs_no_home(name, tmp_path):
     }
     code = "import sst_ros; print(sst_ros.simulate('swing', duration=0.1).status)"
     assert python(code, env=environments[name]).stdout.strip() == "0"
+
+
+def test_steps_under_two_drives_cost_what_they_evaluate():
+    def hold(t, state):
+        return 0.1, 0.2, -0.1
+
+    runs = [
+        simulate(SWING, hold, 0.1, control_period=0.01, memoryless=memoryless)
+        for memoryless in (False, True)
+    ]
+    assert runs[0].quaternion.tolist() == runs[1].quaternion.tolist()
+    assert runs[0].evaluations == runs[1].evaluations
