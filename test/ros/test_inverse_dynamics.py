@@ -265,13 +265,19 @@ def test_gains_are_set_while_it_runs_or_refused_with_the_reason(
 def test_a_stream_of_trajectories_moves_a_run_without_a_jump(nodes, observer, tmp_path):
     """Ten points a second, each a second ahead.
 
-    On a busy machine, so at a quarter of the speed.
+    On a busy machine, so at a quarter of the speed and in lockstep: torques that come
+    late would let the star fall out of its workspace.
     """
     path = written(tmp_path, motion=None)
     reference = observer.listen(JointState, f"{NODE}/reference")
-    nodes.run("simulator", scene=path, wait_for_command=True, real_time_factor=0.25)
+    slowed = {"real_time_factor": 0.25, "sync": "lockstep"}
+    nodes.run("simulator", scene=path, wait_for_command=True, **slowed)
     controller = nodes.run(
-        "inverse_dynamics", scene=path, mode="computed_torque", motion="topic"
+        "inverse_dynamics",
+        scene=path,
+        mode="computed_torque",
+        motion="topic",
+        stamped=True,
     )
     publisher = observer.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
     observer.told("stage", "waiting for a trajectory")
