@@ -97,11 +97,19 @@ def read_version() -> str:
 def compile_c(
     text: str, folder: Path, name: str, *flags: str
 ) -> tuple[ctypes.CDLL, str]:
-    """Compile with gcc and load; also return what gcc says."""
-    file, library = folder / f"{name}.c", folder / f"{name}.so"
+    """Compile with gcc and load; also return what gcc says.
+
+    The flags are for compilation alone: linked with -ffast-math, a library makes the
+    processor treat small numbers as zero in the whole process that loads it.
+    """
+    file = folder / f"{name}.c"
+    code = folder / f"{name}.o"
+    library = folder / f"{name}.so"
     file.write_text(text, encoding="utf-8")
-    command = ["gcc", *flags, "-shared", "-fPIC", "-o", str(library), str(file), "-lm"]
-    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    compile_it = ["gcc", *flags, "-fPIC", "-c", "-o", str(code), str(file)]
+    process = subprocess.run(compile_it, check=True, capture_output=True, text=True)
+    link = ["gcc", "-shared", "-o", str(library), str(code), "-lm"]
+    subprocess.run(link, check=True, capture_output=True, text=True)
     return ctypes.CDLL(str(library)), process.stderr
 
 

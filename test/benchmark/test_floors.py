@@ -4,6 +4,8 @@
 import copy
 import importlib
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -51,3 +53,18 @@ def test_a_batch_in_c_without_fused_operations_has_the_same_bits(tmp_path):
     for one, other in zip(*sets, strict=True):
         np.testing.assert_array_equal(one, other)
     assert not np.array_equal(sets[0][0], y)
+
+
+SMALLEST = """
+import sys
+from pathlib import Path
+from benchmark.c_floor import compile_c
+compile_c("double half(double x) { return 0.5 * x; }", Path(sys.argv[1]), "half",
+          "-O3", "-ffast-math")
+assert 0.5 * sys.float_info.min > 0.0
+"""
+
+
+def test_fast_mathematics_in_c_leaves_the_processors_mode(tmp_path):
+    command = [sys.executable, "-c", SMALLEST, str(tmp_path)]
+    subprocess.run(command, check=True, timeout=60)
