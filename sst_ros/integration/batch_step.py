@@ -46,9 +46,9 @@ from sst_ros.programs.expression import trace
 from sst_ros.programs.llvm import LANES
 from sst_ros.state import QUATERNION, STAR
 
-LANE_BLOCK = 192
-"""Columns of a block at most: their numbers fit the cache of a core, and a step of all
-takes a hundred times as long as the interpreter between two steps."""
+LANE_BLOCK = 768
+"""Columns of a block at most: their numbers fit the second cache of a core, and a step
+of all takes some tens of times as long as the interpreter between two steps."""
 
 CACHE_LINE = 8
 """Doubles in a line of the cache."""
