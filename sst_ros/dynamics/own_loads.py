@@ -169,7 +169,7 @@ _OPERATOR_FUNCTIONS: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
 }
-_CALL_FUNCTIONS: dict[str, Callable[..., Any]] = {
+_PLAIN_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sqrt": generic_math.sqrt,
     "exp": generic_math.exp,
     "sin": generic_math.sin,
@@ -177,6 +177,10 @@ _CALL_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "tanh": generic_math.tanh,
     "atan2": generic_math.atan2,
     "positive": generic_math.positive,
+}
+"""Functions that have the same name in a formula and in a program."""
+_CALL_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **_PLAIN_FUNCTIONS,
     "tan": _tangent,
     "abs": _absolute,
     "min": _smaller,
@@ -200,13 +204,7 @@ _STEP_FUNCTIONS: dict[str, Callable[..., Any]] = {
     "div": operator.truediv,
     "neg": operator.neg,
     "step": _step,
-    "sqrt": generic_math.sqrt,
-    "exp": generic_math.exp,
-    "sin": generic_math.sin,
-    "cos": generic_math.cos,
-    "tanh": generic_math.tanh,
-    "atan2": generic_math.atan2,
-    "positive": generic_math.positive,
+    **_PLAIN_FUNCTIONS,
 }
 
 

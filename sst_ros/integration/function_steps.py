@@ -42,9 +42,9 @@ from sst_ros.integration.steps import (
     move,
     normalise,
     rosenbrock_step,
-    split,
     step_pair,
 )
+from sst_ros.mechanism.generic_math import rows_of
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.compiled import (
     RowsFunction,
@@ -566,7 +566,7 @@ def trace_stages(
     def take_stage(number: int, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
         # Vectors as long as the state: itself, the slopes, and the point.
         vectors_end = (2 + number) * size
-        y, *earlier_slopes, point = split(inputs[:vectors_end], size)
+        y, *earlier_slopes, point = rows_of(inputs[:vectors_end], size)
         own_slope = slope(t, *point, *inputs[vectors_end:])
         slopes = [*earlier_slopes, own_slope]
         if number == stages - 1:
@@ -577,7 +577,7 @@ def trace_stages(
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
         y = inputs[:size]
         z = inputs[size : 2 * size]
-        y_end, z_end = split(inputs[2 * size :], end_size)
+        y_end, z_end = rows_of(inputs[2 * size :], end_size)
         first = NewState.of(y_end, size)
         second = NewState.of(z_end, size)
         pair = compare(h, y, z, first, second, lagged)

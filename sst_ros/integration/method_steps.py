@@ -27,9 +27,9 @@ from sst_ros.integration.steps import (
     explicit_step,
     normalise,
     rosenbrock_step,
-    split,
     step_pair,
 )
+from sst_ros.mechanism.generic_math import rows_of
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.compiled import (
     RowsFunction,
@@ -258,7 +258,7 @@ class _StepTracer:
         else:
             drives: list[Any] = [drive] * len(method.a)
             if self._by_stage:
-                drives = split(drive, self._drive)
+                drives = rows_of(drive, self._drive)
             new = explicit_step(derivative, method, t, h, y, drives)
         return new.numbers()
 
@@ -304,7 +304,7 @@ class _StepTracer:
     ) -> Linearisation:
         size = self._size
         linearise = Routine("linearise", 1 + size + self._drive, (size + 2) * size)
-        slope, by_time, *columns = split(linearise(t, *y, *numbers), size)
+        slope, by_time, *columns = rows_of(linearise(t, *y, *numbers), size)
         return Linearisation(slope, by_time, columns)
 
 

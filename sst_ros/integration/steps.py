@@ -347,11 +347,6 @@ def compare(
     return Pair(normalise(new_y), normalise(new_z), size, total)
 
 
-def split(numbers: Numbers, size: int) -> list[Numbers]:
-    """Divide numbers into consecutive groups of `size`."""
-    return [numbers[k : k + size] for k in range(0, len(numbers), size)]
-
-
 def add_up(numbers: Numbers) -> Number:
     """Return the sum of numbers, from the first to the last.
 

@@ -8,7 +8,7 @@ expressions) or through NumPy (columns, complex numbers) or mpmath.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -250,6 +250,11 @@ def triple(numbers: Iterable[Scalar]) -> Triple:
     """Return three numbers as a triple."""
     first, second, third = numbers
     return (first, second, third)
+
+
+def rows_of(numbers: Sequence[Any], size: int) -> list[Any]:
+    """Divide numbers into rows of `size` numbers."""
+    return [numbers[k : k + size] for k in range(0, len(numbers), size)]
 
 
 def symmetric_rows(matrix: Symmetric) -> Rows:

@@ -161,11 +161,6 @@ def inner_product(left: Sequence[Any], right: Sequence[Any]) -> Any:
     return total
 
 
-def rows_of(numbers: Sequence[Any], size: int) -> list[Any]:
-    """Divide numbers into rows of `size` numbers."""
-    return [numbers[k : k + size] for k in range(0, len(numbers), size)]
-
-
 def column(numbers: Sequence[Any]) -> Any:
     """Return a matrix of one column."""
     return arb_mat([[x] for x in numbers])

@@ -49,6 +49,7 @@ from sst_ros.mechanism.generic_math import (
     cross3,
     dot3,
     quaternion_product,
+    rows_of,
     triple,
 )
 from sst_ros.mechanism.geometry import Array, Geometry
@@ -64,7 +65,6 @@ from sst_ros.proof.balls import (
     inner_product,
     norm,
     precision,
-    rows_of,
     upper,
     write_down,
     write_up,

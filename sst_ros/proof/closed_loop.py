@@ -28,6 +28,7 @@ from sst_ros.mechanism.generic_math import (
     axpy,
     multiply,
     quaternion_product,
+    rows_of,
     triple,
 )
 from sst_ros.programs.expression import divide, trace
@@ -44,7 +45,6 @@ from sst_ros.proof.balls import (
     magnitude,
     middles,
     radii,
-    rows_of,
     zeros,
 )
 from sst_ros.proof.enclosure import (

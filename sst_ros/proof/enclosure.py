@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
+from sst_ros.mechanism.generic_math import rows_of
 from sst_ros.programs.expression import MATH_FUNCTIONS, Program, execute
 from sst_ros.proof.balls import (
     arb,
@@ -42,7 +43,6 @@ from sst_ros.proof.balls import (
     magnitude,
     middles,
     radii,
-    rows_of,
     zeros,
 )
 

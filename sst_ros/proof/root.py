@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from sst_ros.mechanism.generic_math import rows_of
 from sst_ros.proof.balls import (
     PRECISION,
     arb,
@@ -14,7 +15,6 @@ from sst_ros.proof.balls import (
     from_columns,
     magnitude,
     middles,
-    rows_of,
 )
 from sst_ros.proof.enclosure import Function, Refused
 

@@ -42,7 +42,7 @@ from sst_ros.errors import (
     require,
 )
 from sst_ros.mechanism import kinematics
-from sst_ros.mechanism.generic_math import cos, cross3, sin
+from sst_ros.mechanism.generic_math import cos, cross3, rows_of, sin
 from sst_ros.mechanism.geometry import (
     Array,
     Geometry,
@@ -60,7 +60,6 @@ from sst_ros.proof.balls import (
     percent_down,
     percent_up,
     precision,
-    rows_of,
     upper,
     write_down,
 )

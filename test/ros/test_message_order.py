@@ -99,19 +99,19 @@ def make(ros):
             one.follower.close()
 
 
+ONE_QUICK_KIND = slow_except(
+    [TorquePlayer],
+    [TorquePlayer, InverseDynamicsController],
+    mark=pytest.mark.breadth,
+)
+
+
 def give(worker, message):
     """Call back as the executor does."""
     (worker.hear if isinstance(message, String) else worker.receive)(message)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    slow_except(
-        [TorquePlayer],
-        [TorquePlayer, InverseDynamicsController],
-        mark=pytest.mark.breadth,
-    ),
-)
+@pytest.mark.parametrize("kind", ONE_QUICK_KIND)
 def test_a_fault_ends_who_commands_in_every_order_of_messages(make, kind):
     for messages in orders(PHASES, STATES):
         worker = make(kind)
@@ -133,14 +133,7 @@ def test_a_fault_is_no_concern_of_who_has_not_commanded(make, kind):
     assert len(worker._commands.sent) == 1
 
 
-@pytest.mark.parametrize(
-    "kind",
-    slow_except(
-        [TorquePlayer],
-        [TorquePlayer, InverseDynamicsController],
-        mark=pytest.mark.breadth,
-    ),
-)
+@pytest.mark.parametrize("kind", ONE_QUICK_KIND)
 def test_the_end_of_the_run_ends_who_commands_in_every_order(make, kind):
     """Answers that are still to be given are given first: the node looks later."""
     for messages in orders([*PHASES[:2], String(data="finished")], STATES[:3]):
