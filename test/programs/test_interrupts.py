@@ -25,7 +25,7 @@ def of_state(t, state):
     return REST
 
 batch = sst_ros.Batch("swing")
-simulation = sst_ros.Simulation("swing")
+simulation = sst_ros.Simulation("swing", step_budget=10**12)
 gamma = [(0.8, 0.8, 0.8)] * 20_000
 {first}
 threading.Timer(0.5, print, ("running",), dict(flush=True)).start()
