@@ -137,6 +137,23 @@ def test_torques_that_switch_with_the_state_end_with_advice(most, monkeypatch):
     assert np.isfinite(motion.quaternion).all()
 
 
+@pytest.mark.parametrize("method", ["dop853", "dopri5", "rodas5p"])
+def test_a_budget_spent_near_a_limit_ends_a_motion_by_status(method, monkeypatch):
+    """Spent by the last sample, the budget came out as an error."""
+
+    def push(t, state):
+        return 0.5 * t + 0.01 * state.joints.gamma_dot[0], 0.3, 0.2
+
+    whole = simulate("example2_stroke", push, 2.0, method=method, tolerance=1e-4)
+    assert whole.status == 1
+    for most in range(whole.evaluations - 100, whole.evaluations + 1):
+        monkeypatch.setattr("sst_ros.simulation.simulate._FUNCTION_BUDGET", most)
+        motion = simulate("example2_stroke", push, 2.0, method=method, tolerance=1e-4)
+        assert motion.status in (-1, 1)
+        if motion.status == 1:  # by the last run, or by one before
+            assert abs(motion.t[-1] - whole.t[-1]) < 1e-4
+
+
 def test_a_looser_tolerance_costs_less():
     costs = [
         simulate(SWING, switch, 0.02, tolerance=tol).evaluations for tol in (1e-3, 1e-7)

@@ -142,7 +142,7 @@ class FunctionSteps:
 
         pair = step_pair(step, t, h, point.y, point.z, lagged_torques(self._ode))
         joints = self._ode.dynamics.joints(*pair.y[STAR])
-        return read_outcome(pair_outputs(pair, joints), point, self._size)
+        return read_outcome([*pair_outputs(pair, joints)], point, self._size)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive

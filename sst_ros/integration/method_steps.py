@@ -335,13 +335,13 @@ def pair_outputs(pair: Pair, joints: Sequence[Any]) -> tuple[Any, ...]:
 
 
 def read_outcome(
-    numbers: Sequence[float], point: Point, size: int, stages: Sequence[Any] = ()
+    numbers: list[float], point: Point, size: int, stages: Sequence[Any] = ()
 ) -> Outcome:
     """Read the outputs of `pair`, see `pair_outputs`."""
     error, total = numbers[-2:]
     after = Point(  # a call of `_replace` takes three times as long
-        [*numbers[:size]],
-        [*numbers[size : 2 * size]],
+        numbers[:size],
+        numbers[size : 2 * size],
         tuple(numbers[2 * size : 2 * size + JOINT_NUMBERS]),
         point.method,
         point.h,

@@ -9,8 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import STATE_SIZE
-from sst_ros.integration.function_steps import TimeSteps
-from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.point import Step
 from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.torque_profile import Torque
@@ -66,21 +64,13 @@ class Samples:
     def add_inside(
         self, times: Sequence[float], torque: Torque, step: Step, begin: float
     ) -> None:
-        """Note times [s] that lie inside a step which begins at `begin` [s].
-
-        Raises BudgetSpent where the torque is a function, which is called for each.
-        """
-        if self._times and self._times[-1] >= times[0]:
+        """Note times [s] inside a compiled step that begins at `begin` [s]."""
+        if not times or (self._times and self._times[-1] >= times[0]):
             return
-        if isinstance(step.steps, (MethodSteps, TimeSteps)):
-            self.evaluations += len(times) * step.steps.cost
-            first = len(self._times)
-            self._step_samples.append(_StepSamples(step, begin, first, len(times)))
-            self._note(times, torque)
-            return
-        for time in times:
-            self._stepper.budget.charge(step.steps.cost)
-            self.add(time, torque, step.inside(time - begin))
+        self.evaluations += len(times) * step.steps.cost
+        first = len(self._times)
+        self._step_samples.append(_StepSamples(step, begin, first, len(times)))
+        self._note(times, torque)
 
     def _note(self, times: Sequence[float], torque: Torque) -> None:
         """Note times of samples, and the torque that acts at them."""
@@ -109,10 +99,10 @@ class Samples:
             groups.setdefault(id(samples.step.steps), []).append(samples)
         for group in groups.values():
             steps, begins, firsts, counts = zip(*group, strict=True)
-            ranges = []
-            for first, count in zip(firsts, counts, strict=True):
-                ranges.append(np.arange(first, first + count))
-            places = np.concatenate(ranges)
+            # The samples of a step are consecutive, from its first one on.
+            number = np.arange(sum(counts))
+            skipped = np.subtract(firsts, np.cumsum(counts) - counts)
+            places = number + np.repeat(skipped, counts)
             x = t[places] - np.repeat(begins, counts)
             states[places] = steps[0].steps.states_inside(steps, counts, x)
 

@@ -229,6 +229,8 @@ def _read_longest_step(max_step: float | None, span_ns: int) -> float:
 
 def _read_breaks(breaks: TimesLike, span_ns: int) -> Array:
     """Return the times inside the motion [s] at which a function jumps."""
+    if isinstance(breaks, tuple) and not breaks:  # the default: nothing to check
+        return np.zeros(0)
     times = np.atleast_1d(read_numbers("simulate", "breaks", breaks, seconds=True))
     requirement = "must be ascending times [s]"
     refuse_unless("simulate", ("breaks", breaks, ascend(times), requirement))

@@ -125,7 +125,7 @@ class SteppedMotion:
             self.status = 1
             reason = reached.limit.reason
             end = math.floor(reached.time * NANOSECONDS) / NANOSECONDS
-            self._take_between([end])
+            self._take_at_limit(end)
             self.time = reached.time
         except CannotStep as error:
             self.status = -1
@@ -216,12 +216,27 @@ class SteppedMotion:
         if times[0] <= begin:  # the time of its begin, but for rounding
             self._take(times[0], step.begin.y)
             times = times[1:]
-        states = self._interpolate(step, [time - begin for time in times])
-        if states is not None:
-            for time, y in zip(times, states, strict=True):
-                self._take(time, y)
-        elif times:
+        # The samples of compiled steps are computed together, at the end.
+        if isinstance(step.steps, (MethodSteps, TimeSteps)):
             self.samples.add_inside(times, self._torque, step, begin)
+            return
+        x = [time - begin for time in times]
+        states = self._interpolate(step, x)
+        if states is None:
+            states = [self._step_inside(step, after) for after in x]
+        for time, y in zip(times, states, strict=True):
+            self._take(time, y)
+
+    def _take_at_limit(self, time: float) -> None:
+        """Take the last sample, in the last step; the budget need not allow for it."""
+        step = self._step
+        assert step is not None
+        x = time - self._step_begin
+        y = step.begin.y
+        if x > 0.0:  # not the time of its begin, but for rounding
+            self.samples.evaluations += step.steps.cost
+            y = step.inside(x)
+        self._take(time, y)
 
     def _warn_if_hopeless(self, share: float) -> None:
         """Warn once if the motion would far exceed its budget, `share` being done."""
@@ -243,9 +258,6 @@ class SteppedMotion:
         by more than the tolerance: the one where its error is largest.
         """
         steps = step.steps
-        # The samples of compiled steps are computed together, at the end.
-        if isinstance(steps, (MethodSteps, TimeSteps)):
-            return None
         cost = steps.interpolation_cost + steps.cost
         if cost > len(x) * steps.cost:
             return None
@@ -257,6 +269,11 @@ class SteppedMotion:
         *states, checked = polynomial(np.array([*x, worst])).tolist()
         distance = state_distance(checked, step.inside(worst))
         return states if distance <= self._task.tolerance else None
+
+    def _step_inside(self, step: Step, x: float) -> list[float]:
+        """Return the state at x after the begin of a step [s], by a shorter step."""
+        self._budget.charge(step.steps.cost)
+        return step.inside(x)
 
     def _take_if_wanted(self, time: float, y: Sequence[float]) -> None:
         """Take a sample at a time and a state if it is the next one."""
