@@ -78,6 +78,23 @@ class Client:
             ErrorCode(reply.result.error_code),
         ), reply.result.error_string
 
+    def times(self):
+        """Times of the feedback on its trajectory [s]."""
+        return [
+            1e-9 * nanoseconds(message.desired.time_from_start)
+            for message in self.feedback
+        ]
+
+    def reached(self, time):
+        """Wait for the feedback of a time on the trajectory [s].
+
+        To be called before the result: rclpy takes one feedback at a time, and hears
+        none of those left when the result comes.
+        """
+        self.observer.until(
+            lambda: max(self.times(), default=0.0) >= time, "the last feedback"
+        )
+
     def moving(self, count=3):
         self.observer.until(lambda: len(self.feedback) > count, "feedback")
 
@@ -121,20 +138,12 @@ def client(types, tmp_path_factory, request):
 def test_a_goal_is_followed_with_feedback_and_succeeds(client):
     handle = client.send((0.2, HOME), (0.6, AWAY))
     assert handle.accepted
-
-    def times():
-        return [
-            1e-9 * nanoseconds(message.desired.time_from_start)
-            for message in client.feedback
-        ]
-
-    # rclpy takes one feedback at a time, and hears none of those left when the result
-    # comes.
-    client.observer.until(lambda: max(times(), default=0.0) >= 0.6, "the last feedback")
+    client.reached(0.6)
     ending, said = client.result(handle)
     assert ending == SUCCEEDED, said
-    assert len(client.feedback) > 3 and times() == sorted(times())
-    for time, message in zip(times(), client.feedback, strict=True):
+    times = client.times()
+    assert len(times) > 3 and times == sorted(times)
+    for time, message in zip(times, client.feedback, strict=True):
         assert message.joint_names == NAMES
         assert message.index == (0 if time < 0.2 else 1)
         off = np.subtract(message.desired.positions, message.actual.positions)
@@ -148,6 +157,7 @@ def test_a_goal_of_some_joints_leaves_the_others(client):
     far = client.far_from(start)
     handle = client.send((0.4, far[1:2]), names=NAMES[1:2])
     assert handle.accepted
+    client.reached(0.4)
     ending, said = client.result(handle)
     assert ending == SUCCEEDED, said
     expected = [start[0], far[1], start[2]]
