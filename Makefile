@@ -54,8 +54,9 @@ test-jazzy:  ## run the tests of the nodes with ROS 2 Jazzy, in an environment o
 test-ros: $(VENV)/.ros  ## run the tests of the nodes
 	$(PYTEST) $(PARALLEL_NODES) -m "not slow" test/ros
 
+# By path: pytest would leave the files with few tests, whose tests are the longest, for the end, to one processor.
 test-slow: $(VENV)/.test $(VENV)/.docs  ## run the slow tests: sweeps, long pages, packages, fresh environments
-	$(PYTEST) $(PARALLEL) -m slow --ignore test/ros --timeout 600
+	$(PYTEST) $(PARALLEL) --no-loadscope-reorder -m slow --ignore test/ros --timeout 600
 	$(PYTEST) $(PARALLEL) -m "slow or breadth" test/ros --timeout 600
 
 # Lines and branches that the tests without nodes pass, those of child processes not counted.

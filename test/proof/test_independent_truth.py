@@ -28,7 +28,7 @@ from slow_cases import slow_except
 
 TIMES = [0.03125, 0.0625]  # [s], exact as doubles
 CORNERS, INSIDE = 20, 5
-MORE = range(12, 48)  # scenes of the slow test, of 300
+MORE = range(12, 36)  # scenes of the slow test, of 300
 KINDS = ("converted", "ranges", "kinks")
 FAMILY = 2511  # of the seeds that these tests take
 QUICK = (6,)
