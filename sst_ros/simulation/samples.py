@@ -64,8 +64,8 @@ class Samples:
     def add_inside(
         self, times: Sequence[float], torque: Torque, step: Step, begin: float
     ) -> None:
-        """Note times [s] inside a compiled step that begins at `begin` [s]."""
-        if not times or (self._times and self._times[-1] >= times[0]):
+        """Note later times [s] inside a compiled step that begins at `begin` [s]."""
+        if not times:
             return
         self.evaluations += len(times) * step.steps.cost
         first = len(self._times)
