@@ -11,17 +11,19 @@ distance of a second solution, which leaps over the same change.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 from sst_ros.dynamics.model import CONTACT_BAND, GRAZING, Limit, Transition
+from sst_ros.mechanism.generic_math import Scalar, absolute, larger, select
 from sst_ros.state import JOINT_COUNT
 
 Signal = Callable[[float], float]
 Joints = Callable[[float], Sequence[float]]
 """Angles and rates of the joints at a time in a step [s]."""
-JointRanges = Sequence[tuple[int, float, float]]
+JointRanges = tuple[tuple[int, float, float], ...]
 """A joint, and the least and largest angle inside of all its limits [rad]."""
 
 TIME_TOLERANCE = 1e-15
@@ -32,24 +34,34 @@ _ENTRY = 0.5
 """Share of the width that a step which was shortened passes: rates are not linear."""
 
 
-def all_far(
-    ranges: JointRanges, begin: Sequence[float], end: Sequence[float], h: float
-) -> bool:
-    """Test quickly that no joint can have reached a limit in a step of h [s].
+def largest_overshoot(
+    ranges: JointRanges, h: Scalar, begin: Sequence[Scalar], end: Sequence[Scalar]
+) -> Scalar:
+    """Return a number that is negative where no joint can have reached a limit.
 
-    None has where all are inside their range at both ends of the step, and each that
-    has turned is farther from its limits than its rates would take it in ten times h.
+    None has in a step where all are inside their range at both ends, and each that has
+    turned is farther from its limits than its rates would take it in ten times h.
+
+    Args:
+        ranges: of the joints.
+        h: length of the step [s].
+        begin: joints at its begin, numbers of any kind; `end` alike.
+        end: joints at its end.
+
     """
+    largest: Scalar = -1.0
     for joint, least, most in ranges:
-        if not (least < begin[joint] < most and least <= end[joint] <= most):
-            return False
-        before, after = begin[joint + JOINT_COUNT], end[joint + JOINT_COUNT]
-        if before * after < 0.0:
-            reach = _REACH * h * max(abs(before), abs(after))
-            lower, upper = min(begin[joint], end[joint]), max(begin[joint], end[joint])
-            if not (least + reach < lower and upper < most - reach):
-                return False
-    return True
+        before = begin[joint + JOINT_COUNT]
+        after = end[joint + JOINT_COUNT]
+        fastest = larger(absolute(before), absolute(after))
+        has_turned = -(before * after)
+        reach = select(has_turned, _REACH * h * fastest, 0.0)
+        for angle in (begin[joint], end[joint]):
+            if least > -math.inf:
+                largest = larger(largest, least + reach - angle)
+            if most < math.inf:
+                largest = larger(largest, angle + reach - most)
+    return largest
 
 
 def may_occur(event: Limit, begin: Sequence[float], end: Sequence[float]) -> bool:

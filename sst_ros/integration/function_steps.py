@@ -21,6 +21,7 @@ from numpy.polynomial.chebyshev import chebvander
 
 from sst_ros.dynamics.traced_dynamics import LEGS, ODE, STATE_SIZE
 from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.events import JointRanges, largest_overshoot
 from sst_ros.integration.method_steps import (
     JOINT_NUMBERS,
     STEP_LENGTH,
@@ -29,6 +30,7 @@ from sst_ros.integration.method_steps import (
     pair_outputs,
     read_outcome,
     step_cost,
+    trace_overshoot,
     trace_steps,
 )
 from sst_ros.integration.methods import DenseOutput, Method, Rosenbrock, Tableau
@@ -79,6 +81,7 @@ class FunctionSteps:
         ode: what is integrated; the first three numbers of its drive are the torques.
         method: how.
         torque: evaluates the functions.
+        ranges: of the joints, inside of the limits that a step may meet.
         derivative: of the state in place of that of the ODE, with the same inputs.
 
     Attributes:
@@ -96,6 +99,7 @@ class FunctionSteps:
         ode: ODE,
         method: Method,
         torque: AppliedTorque,
+        ranges: JointRanges = (),
         derivative: Callable[..., Sequence[float]] | None = None,
     ) -> None:
         if derivative is not None and isinstance(method, Rosenbrock):
@@ -105,6 +109,7 @@ class FunctionSteps:
         self.method = method
         self._ode = ode
         self._torque = torque
+        self._ranges = ranges
         self._derivative = derivative
         self.cost = step_cost(method)
         # steps to the three inner quarters, and slopes at five points
@@ -142,7 +147,9 @@ class FunctionSteps:
 
         pair = step_pair(step, t, h, point.y, point.z, lagged_torques(self._ode))
         joints = self._ode.dynamics.joints(*pair.y[STAR])
-        return read_outcome([*pair_outputs(pair, joints)], point, self._size)
+        overshoot = largest_overshoot(self._ranges, h, point.joints, joints)
+        numbers = pair_outputs(pair, joints, overshoot)
+        return read_outcome([*numbers], self._size)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -219,7 +226,7 @@ class TimeSteps(FunctionSteps):
 
     @cached_property
     def _functions(self) -> dict[str, Function]:
-        return compile_by_stage(self._ode, self.method)
+        return compile_by_stage(self._ode, self.method, self._ranges)
 
     def load(self) -> None:
         """Have the code compiled that a run calls."""
@@ -248,7 +255,7 @@ class TimeSteps(FunctionSteps):
         torques = self._torques_at(times, drive)
         stages = self._join(torques, drive)
         numbers = self._functions["pair"](t, h, *point.y, *point.z, *stages)
-        return read_outcome(numbers, point, self._size, torques)
+        return read_outcome(numbers, self._size, torques)
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -275,7 +282,7 @@ class TimeSteps(FunctionSteps):
         moments = moments.repeat(counts, axis=0)[:, None, :]
         moments = moments.repeat(len(self.method.c), axis=1)
         drives = np.concatenate([torques, moments], axis=2).reshape(len(x), -1)
-        single = compile_rows_by_stage(self._ode, self.method)
+        single = compile_rows_by_stage(self._ode, self.method, self._ranges)
         return single(np.hstack([begins, drives]))
 
     def _times(self, t: float, h: float) -> list[float]:
@@ -333,24 +340,31 @@ class TimeSteps(FunctionSteps):
 
 
 @lru_cache(maxsize=64)
-def compile_by_stage(ode: ODE, method: Tableau) -> dict[str, Function]:
+def compile_by_stage(
+    ode: ODE, method: Tableau, ranges: JointRanges
+) -> dict[str, Function]:
     """Compile `pair` and `single` of steps that take the torques of each stage."""
-    return compile_functions(_trace_by_stage(ode, method), ("pair", "single"))
+    return compile_functions(_trace_by_stage(ode, method, ranges), ("pair", "single"))
 
 
 @lru_cache(maxsize=64)
-def compile_rows_by_stage(ode: ODE, method: Tableau) -> RowsFunction:
+def compile_rows_by_stage(
+    ode: ODE, method: Tableau, ranges: JointRanges
+) -> RowsFunction:
     """Compile `single` of `compile_by_stage` for rows of inputs."""
-    return compile_rows(_trace_by_stage(ode, method), "single")
+    return compile_rows(_trace_by_stage(ode, method, ranges), "single")
 
 
-def _trace_by_stage(ode: ODE, method: Tableau) -> dict[str, Program]:
+def _trace_by_stage(
+    ode: ODE, method: Tableau, ranges: JointRanges
+) -> dict[str, Program]:
     steps = trace_steps(
         method, len(ode.state), len(ode.drive), lagged_torques(ode), by_stage=True
     )
     return {
         "slope": ode.program,
         "joints": ode.dynamics.joints_program,
+        "overshoot": trace_overshoot(ranges),
         **steps,
     }
 
@@ -399,15 +413,21 @@ class FeedbackSteps(FunctionSteps):
 
     method: Tableau
 
-    def __init__(self, ode: ODE, method: Tableau, torque: AppliedTorque) -> None:
-        super().__init__(ode, method, torque)
+    def __init__(
+        self,
+        ode: ODE,
+        method: Tableau,
+        torque: AppliedTorque,
+        ranges: JointRanges = (),
+    ) -> None:
+        super().__init__(ode, method, torque, ranges)
         if method.dense is not None:
             self.interpolation_cost = 1 + len(method.dense.c)
             self.worst = _WORST_OF_DENSE
 
     @cached_property
     def _functions(self) -> dict[str, Function]:
-        return compile_stages(self._ode, self.method)
+        return compile_stages(self._ode, self.method, self._ranges)
 
     @cached_property
     def _stages(self) -> list[tuple[float, Function]]:
@@ -444,7 +464,7 @@ class FeedbackSteps(FunctionSteps):
             t + half, half, middle, joints(*middle[STAR]), second_drive
         )
         numbers = self._functions["end"](h, *point.y, *z, *y_end, *z_end)
-        return read_outcome(numbers, point, self._size, slopes)
+        return read_outcome(numbers, self._size, slopes)
 
     def _step(
         self,
@@ -534,12 +554,15 @@ def _arrays_of_dense(dense: DenseOutput) -> tuple[list[Array], Array]:
 
 
 @lru_cache(maxsize=64)
-def compile_stages(ode: ODE, method: Tableau) -> dict[str, Function]:
+def compile_stages(
+    ode: ODE, method: Tableau, ranges: JointRanges
+) -> dict[str, Function]:
     """Compile the programs of `trace_stages`, and `joints`."""
     stages = trace_stages(method, len(ode.state), len(ode.drive), lagged_torques(ode))
     programs = {
         "slope": ode.program,
         "joints": ode.dynamics.joints_program,
+        "overshoot": trace_overshoot(ranges),
         **stages,
     }
     return compile_functions(programs, (*stages, "joints"))
@@ -560,6 +583,7 @@ def trace_stages(
     """
     slope = Routine("slope", 1 + size + drive, size)
     joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
+    overshoot_of = Routine("overshoot", 1 + 2 * JOINT_NUMBERS, 1)
     stages = len(method.a)
     end_size = count_step_outputs(method, size)
 
@@ -581,7 +605,9 @@ def trace_stages(
         first = NewState.of(y_end, size)
         second = NewState.of(z_end, size)
         pair = compare(h, y, z, first, second, lagged)
-        return pair_outputs(pair, joints(*pair.y[STAR]))
+        end_joints = joints(*pair.y[STAR])
+        (overshoot,) = overshoot_of(h, *joints(*y[STAR]), *end_joints)
+        return pair_outputs(pair, end_joints, overshoot)
 
     programs = {}
     for number in range(stages):

@@ -10,6 +10,7 @@ in as inputs; see `function_steps.py`.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sst_ros.dynamics.traced_dynamics import LAG, ODE, STATE_SIZE
+from sst_ros.integration.events import JointRanges, largest_overshoot
 from sst_ros.integration.methods import Method, Rosenbrock
 from sst_ros.integration.point import Drive, Outcome, Point, Step
 from sst_ros.integration.steps import (
@@ -29,14 +31,14 @@ from sst_ros.integration.steps import (
     rosenbrock_step,
     step_pair,
 )
-from sst_ros.mechanism.generic_math import rows_of
+from sst_ros.mechanism.generic_math import absolute, rows_of, select
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.compiled import (
     RowsFunction,
     compile_functions,
     compile_rows,
 )
-from sst_ros.programs.expression import Program, Routine, trace
+from sst_ros.programs.expression import Number, Program, Routine, trace
 from sst_ros.programs.llvm import Function
 from sst_ros.state import JOINT_COUNT, STAR, cached_property
 
@@ -45,6 +47,11 @@ JACOBIAN_COST = 30
 
 JOINT_NUMBERS = 2 * JOINT_COUNT
 """Numbers of `joints`: the angles and their rates."""
+
+_LARGEST = sys.float_info.max
+
+PERIODS_AT_ONCE = 16
+"""Periods of one call of `periods`: its own cost is then a small part of theirs."""
 
 STEP_LENGTH = 1
 """Place of the length of a step among the inputs of `single`."""
@@ -63,6 +70,7 @@ class MethodSteps:
     Args:
         ode: what is integrated; its drive is the numbers of a `Drive`.
         method: how.
+        ranges: of the joints, inside of the limits that a step may meet.
 
     Attributes:
         method: as given.
@@ -70,9 +78,10 @@ class MethodSteps:
 
     """
 
-    def __init__(self, ode: ODE, method: Method) -> None:
+    def __init__(self, ode: ODE, method: Method, ranges: JointRanges = ()) -> None:
         self.method = method
         self._ode = ode
+        self._ranges = ranges
         self.cost = step_cost(method)
         self._size = len(ode.state)
 
@@ -84,6 +93,7 @@ class MethodSteps:
         programs = {
             "slope": ode.program,
             "joints": ode.dynamics.joints_program,
+            "overshoot": trace_overshoot(self._ranges),
             **trace_steps(method, self._size, len(ode.drive), lagged_torques(ode)),
         }
         if isinstance(method, Rosenbrock):
@@ -95,12 +105,21 @@ class MethodSteps:
         return compile_functions(self._programs, ("pair", "single", "slope"))
 
     @cached_property
+    def _periods(self) -> Function:
+        drive_size = len(self._ode.drive)
+        program = trace_periods(self._size, drive_size)
+        programs = {**self._programs, "periods": program}
+        return compile_functions(programs, ("periods",))["periods"]
+
+    @cached_property
     def _single_of_rows(self) -> RowsFunction:
         return compile_rows(self._programs, "single")
 
     def load(self) -> None:
         """Have the code compiled that a run calls."""
         _ = self._functions
+        if not isinstance(self.method, Rosenbrock):
+            _ = self._periods
 
     def pair(
         self,
@@ -121,7 +140,34 @@ class MethodSteps:
         numbers = self._functions["pair"](
             t, h, *point.y, *point.z, *drive.numbers, *second_drive.numbers
         )
-        return read_outcome(numbers, point, self._size)
+        return read_outcome(numbers, self._size)
+
+    def periods(
+        self, h: float, point: Point, drive: Drive, tolerance: float
+    ) -> tuple[Point, list[float]]:
+        """Advance through equal periods of h under one drive, by a step of each.
+
+        They are PERIODS_AT_ONCE, or those before one that is not plain, see
+        `trace_periods`.
+
+        Returns:
+            The point at the end, but for the length of its next step, and the size of
+            the error of each period. Without any the point is not to be used.
+
+        """
+        size = self._size
+        z_end = 2 * size
+        joints_end = z_end + JOINT_NUMBERS
+        numbers = self._periods(h, tolerance, *point.y, *point.z, *drive.numbers)
+        *sizes, count = numbers[joints_end:]
+        number = int(count)
+        end = point._replace(
+            y=numbers[:size],
+            z=numbers[size:z_end],
+            joints=tuple(numbers[z_end:joints_end]),
+            steps=point.steps + number,
+        )
+        return end, sizes[:number]
 
     def single(
         self, t: float, h: float, y: Sequence[float], drive: Drive
@@ -177,9 +223,30 @@ class MethodSteps:
 
 
 @lru_cache(maxsize=64)
-def steps_of(ode: ODE, method: Method) -> MethodSteps:
+def steps_of(ode: ODE, method: Method, ranges: JointRanges = ()) -> MethodSteps:
     """Return the steps of an ODE by a method, compiled once for all its runs."""
-    return MethodSteps(ode, method)
+    return MethodSteps(ode, method, ranges)
+
+
+@lru_cache(maxsize=64)
+def trace_overshoot(ranges: JointRanges) -> Program:
+    """Trace `largest_overshoot` as the program `overshoot`.
+
+    Its inputs are the length of a step, and the joints at its begin and its end.
+    """
+    numbers = []
+    for joint, least, most in ranges:
+        least = Number(least, ("least", joint))
+        most = Number(most, ("most", joint))
+        numbers.append((joint, least, most))
+
+    def compute(h: Any, *joints: Any) -> tuple[Any]:
+        begin = joints[:JOINT_NUMBERS]
+        end = joints[JOINT_NUMBERS:]
+        return (largest_overshoot(tuple(numbers), h, begin, end),)
+
+    names = [f"i{k}" for k in range(2 * JOINT_NUMBERS)]
+    return trace(compute, ("h", *names))
 
 
 @lru_cache(maxsize=64)
@@ -189,11 +256,10 @@ def trace_steps(
     """Trace the programs `step`, `pair` and `single` of a method.
 
     They call the programs `slope` (t, state, drive), `joints` (first seven numbers of
-    the state) and, of a Rosenbrock method, `linearise`, which has the outputs of
-    `ODE.jacobian`. Inputs of `pair` are t, h, both solutions and their drives; outputs
-    both new solutions, the joints of the first, the size of its error, and a total that
-    is finite where all numbers are. Inputs of `single` are t, h, state and drive; its
-    outputs are the new state.
+    the state), `overshoot` (see `trace_overshoot`) and, of a Rosenbrock method,
+    `linearise`, which has the outputs of `ODE.jacobian`. Inputs of `pair` are t, h,
+    both solutions and their drives; for its outputs see `pair_outputs`. Inputs of
+    `single` are t, h, state and drive; its outputs are the new state.
 
     Args:
         method: how.
@@ -220,6 +286,52 @@ def trace_steps(
     }
 
 
+@lru_cache(maxsize=64)
+def trace_periods(size: int, drive: int) -> Program:
+    """Trace the program `periods`: PERIODS_AT_ONCE equal periods by one step each.
+
+    It calls the program `pair`. A period is plain where the error of its step is below
+    the tolerance, all numbers are finite, and no joint can have reached a limit. The
+    first that is not ends them: what follows it is not used. Inputs are the length of a
+    period, the tolerance, both solutions and the drive. Outputs are both solutions and
+    the joints at the end of the last plain period, the size of the error of each, and
+    their number.
+
+    Args:
+        size: numbers of the state.
+        drive: numbers of the drive.
+
+    """
+    solutions_size = 2 * size
+    output_count = solutions_size + JOINT_NUMBERS + 3  # see `pair_outputs`
+    pair = Routine("pair", 2 + solutions_size + 2 * drive, output_count)
+
+    def take(h: Any, tolerance: Any, *inputs: Any) -> list[Any]:
+        drive_numbers = inputs[solutions_size:]
+        last = [*inputs[:solutions_size], *[0.0] * JOINT_NUMBERS]
+        sizes = []
+        is_plain: Any = 1.0
+        count: Any = 0.0
+        for _ in range(PERIODS_AT_ONCE):
+            solutions = last[:solutions_size]
+            results = pair(0.0, h, *solutions, *drive_numbers, *drive_numbers)
+            *ends, error, total, overshoot = results
+            is_plain = select(tolerance - error, is_plain, 0.0)
+            is_plain = select(_LARGEST - absolute(total), is_plain, 0.0)
+            is_plain = select(-overshoot, is_plain, 0.0)
+            count = count + is_plain
+            sizes.append(error)
+            last = [
+                select(is_plain, after, before)
+                for before, after in zip(last, ends, strict=True)
+            ]
+        return [*last, *sizes, count]
+
+    solutions = [f"y{i}" for i in range(solutions_size)]
+    drives = [f"d{i}" for i in range(drive)]
+    return trace(take, ("h", "tolerance", *solutions, *drives))
+
+
 class _StepTracer:
     """The functions that `trace_steps` traces; it takes the same arguments.
 
@@ -241,6 +353,7 @@ class _StepTracer:
         self.drive_size = drive * len(method.a) if by_stage else drive
         self._slope = Routine("slope", 1 + size + drive, size)
         self._joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
+        self._overshoot = Routine("overshoot", 1 + 2 * JOINT_NUMBERS, 1)
         step_inputs = 2 + size + self.point_size + self.drive_size
         self._step = Routine("step", step_inputs, count_step_outputs(method, size))
 
@@ -284,7 +397,9 @@ class _StepTracer:
             return NewState.of(results, size)
 
         pair = step_pair(call, t, h, y, z, self._lagged)
-        return pair_outputs(pair, self._joints(*pair.y[STAR]))
+        joints = self._joints(*pair.y[STAR])
+        (overshoot,) = self._overshoot(h, *self._joints(*y[STAR]), *joints)
+        return pair_outputs(pair, joints, overshoot)
 
     def take_single(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the new state."""
@@ -325,31 +440,29 @@ def lagged_torques(ode: ODE) -> int:
     return len(LAG) if set(LAG) <= set(ode.state) else 0
 
 
-def pair_outputs(pair: Pair, joints: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the outputs of `pair`: those of `step_pair`, and the joints of the first.
+def pair_outputs(pair: Pair, joints: Sequence[Any], overshoot: Any) -> tuple[Any, ...]:
+    """Return the outputs of `pair`.
 
-    The last is a total that is finite where all numbers are.
+    They are both new solutions, the joints of the first, the size of its error, a total
+    that is finite where all numbers are, and the joints' overshoot.
     """
     total = pair.total + add_up(joints)
-    return (*pair.y, *pair.z, *joints, pair.size, total)
+    return (*pair.y, *pair.z, *joints, pair.size, total, overshoot)
 
 
 def read_outcome(
-    numbers: list[float], point: Point, size: int, stages: Sequence[Any] = ()
+    numbers: list[float], size: int, stages: Sequence[Any] = ()
 ) -> Outcome:
-    """Read the outputs of `pair`, see `pair_outputs`."""
-    error, total = numbers[-2:]
-    after = Point(  # a call of `_replace` takes three times as long
+    """Read the outputs of `pair`, see `pair_outputs`; a state has `size` numbers."""
+    error, total, overshoot = numbers[-3:]
+    return Outcome(
         numbers[:size],
         numbers[size : 2 * size],
         tuple(numbers[2 * size : 2 * size + JOINT_NUMBERS]),
-        point.method,
-        point.h,
-        point.attempts,
-        point.steps + 1,
-        point.changes,
+        error if math.isfinite(total) else math.inf,
+        overshoot < 0.0,
+        stages,
     )
-    return Outcome(after, error if math.isfinite(total) else math.inf, stages)
 
 
 def step_factor(error: float, method: Method) -> float:

@@ -126,8 +126,11 @@ class Drives(NamedTuple):
 class Outcome(NamedTuple):
     """What a step from a point has given."""
 
-    point: Point
+    y: list[float]  # the solution at its end
+    z: list[float]  # the second one
+    joints: tuple[float, ...]  # of y, see `Point`
     size: float  # of the local error, infinite where a number is not finite
+    is_far: bool  # from all limits: no joint can have reached one
     stages: Sequence[Any] = ()  # evaluated in it, for states inside
 
 
@@ -142,6 +145,7 @@ class Step(NamedTuple):
     other: Drive | None  # on the second solution, None where it is the same
     steps: Any  # what has taken it: `MethodSteps` or `FunctionSteps`
     last: bool  # whether it ends with the period
+    is_far: bool  # from all limits, see `Outcome`
     stages: Sequence[Any] = ()  # see `Outcome`
 
     @property

@@ -37,8 +37,8 @@ from sst_ros.dynamics.model import (
 from sst_ros.dynamics.traced_dynamics import STATE_SIZE, Dynamics, recent_ode
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.events import (
-    all_far,
     first_event,
+    largest_overshoot,
     largest_passed,
     may_occur,
     share_before_leap,
@@ -50,6 +50,7 @@ from sst_ros.integration.function_steps import (
 )
 from sst_ros.integration.method_steps import (
     JACOBIAN_COST,
+    PERIODS_AT_ONCE,
     SAFETY,
     MethodSteps,
     step_factor,
@@ -69,6 +70,7 @@ from sst_ros.integration.point import (
     Drive,
     Drives,
     MethodChange,
+    Outcome,
     Period,
     Point,
     Step,
@@ -231,7 +233,7 @@ class Stepper:
         ends = tuple(limits_of(scene, geometry)) if limits else ()
         contacts = tuple(contact_events_of(scene, geometry))
         self._events = (*ends, *contacts)
-        self._ranges = ranges_of([*ends, *free_range(contacts)])
+        self._ranges = tuple(ranges_of([*ends, *free_range(contacts)]))
         self._transitions = transitions_of(scene, tolerance)
         self.torque = AppliedTorque(self.dynamics, scene.torque_limit)
         self._derivative = derivative
@@ -304,7 +306,7 @@ class Stepper:
             step = self._take_step(t, period.h, point, drives, stops, steps)
             steps = step.steps
             event = None
-            if not all_far(self._ranges, step.begin.joints, step.end.joints, step.h):
+            if not step.is_far:
                 try:
                     step, event = self._until_event(step)
                 except _NoState:  # the step has leapt over a singularity
@@ -326,6 +328,45 @@ class Stepper:
             else:
                 t += step.h
         return point
+
+    def advance_evenly(
+        self, point: Point, period: Period, count: int
+    ) -> tuple[Point, int]:
+        """Advance through some equal periods in one call, bit for bit as by `advance`.
+
+        That is done for PERIODS_AT_ONCE of them at most, where each is one explicit
+        step under constant torques, with nothing to look at inside.
+
+        Args:
+            point: where the first begins.
+            period: the first.
+            count: how many there are.
+
+        Returns:
+            Where the last one ends, and how many were done: none where there are too
+            few, or the first takes more than that.
+
+        """
+        if count < PERIODS_AT_ONCE or isinstance(point.method, Rosenbrock):
+            return point, 0
+        drive = self._drive_of(period)
+        steps = self._steps_of(drive, point.method)
+        if not isinstance(steps, MethodSteps) or drive.sine or self._transitions:
+            return point, 0
+        h = period.h
+        cost = PAIR_STEPS * steps.cost
+        is_one_step = self._length_of(point, 0.0, h, ()) == h
+        is_far = largest_overshoot(self._ranges, h, point.joints, point.joints) < 0.0
+        if not (is_one_step and is_far) or cost > self.budget.per_period:
+            return point, 0
+        end, errors = steps.periods(h, point, drive, self._tolerance)
+        longest = point.h
+        for error in errors:
+            growth = step_factor(error / self._tolerance, point.method)
+            longest = max(longest, h * growth)
+            self.budget.begin()
+            self.budget.charge(cost)
+        return end._replace(h=longest), len(errors)
 
     def _drives_of(self, period: Period) -> Drives:
         """Return what acts in a period on both solutions."""
@@ -380,14 +421,16 @@ class Stepper:
         if sine is not None:
             limit = self.torque.limit_of(sine)
             ode = recent_ode(self.dynamics, sine, limit=limit, work=True, phases=True)
-            return steps_of(ode, method)
+            return steps_of(ode, method, self._ranges)
         if function is None:
-            return steps_of(self.ode, method)
+            return steps_of(self.ode, method, self._ranges)
         if self._derivative is not None or isinstance(method, Rosenbrock):
-            return FunctionSteps(self.ode, method, self.torque, self._derivative)
+            return FunctionSteps(
+                self.ode, method, self.torque, self._ranges, self._derivative
+            )
         if function.feedback:
-            return FeedbackSteps(self.ode, method, self.torque)
-        return TimeSteps(self.ode, method, self.torque)
+            return FeedbackSteps(self.ode, method, self.torque, self._ranges)
+        return TimeSteps(self.ode, method, self.torque, self._ranges)
 
     def _take_step(
         self,
@@ -412,15 +455,15 @@ class Stepper:
                 steps = self._steps_of(drive, point.method)
             h = self._length_of(point, t, end, stops)
             self.budget.charge(PAIR_STEPS * steps.cost)
-            after, size, stages = steps.pair(t, h, point, drive, second)
-            error = size / self._tolerance
-            if size <= self._tolerance:
+            outcome = steps.pair(t, h, point, drive, second)
+            error = outcome.size / self._tolerance
+            if outcome.size <= self._tolerance:
                 if looks < _MOST_LOOKS and self._meets_pulse(t, h, point, drive, stops):
                     looks += 1
                     shorter = h if stops else 0.5 * h
                     point = point._replace(h=shorter)
                     continue
-                ends = point.joints, after.joints
+                ends = point.joints, outcome.joints
                 passed = largest_passed(self._transitions, *ends)
                 if passed > 1.0:
                     share = share_before_leap(self._transitions, *ends)
@@ -431,10 +474,18 @@ class Stepper:
                         leaps += 1
                         continue
                 last = h == end - t
-                step = Step(t, h, point, after, drive, second, steps, last, stages)
                 ends_before_jump = bool(stops) and h == stops[0] - t
                 is_cut = last or ends_before_jump
-                return self._plan_next(step, error, passed, is_cut=is_cut)
+                longest = plan_length(point, h, error, passed, is_cut=is_cut)
+                is_implicit = isinstance(point.method, Rosenbrock)
+                counts_attempt = self._chooses and (is_implicit or not last)
+                after = end_of(point, outcome, longest, counts_attempt=counts_attempt)
+                if counts_attempt:
+                    after = self._choose_method(steps, t + h, h, after, drive, 0)
+                return Step(
+                    t, h, point, after, drive, second, steps, last, outcome.is_far,
+                    outcome.stages,
+                )  # fmt: skip
             stops[:] = self._jump_in(t, h, point.y, drive)
             if stops:
                 point = point._replace(h=h)
@@ -458,37 +509,6 @@ class Stepper:
         if stops:  # a step ends before a jump, the next one steps over it
             h = min(h, stops[0] - t)
         return h
-
-    def _plan_next(
-        self, step: Step, error: float, passed: float, *, is_cut: bool
-    ) -> Step:
-        """Return an accepted step whose end has the length and method of the next one.
-
-        Args:
-            step: as it was taken.
-            error: its local error relative to the tolerance.
-            passed: largest share of a change of friction that it has passed over.
-            is_cut: whether it is shorter than the error allows.
-
-        """
-        h = step.h
-        begin = step.begin
-        end = step.end
-        longest = h * step_factor(error, begin.method)
-        if is_cut:  # it does not say that the next must be shorter than allowed before
-            longest = max(begin.h, longest)
-        if passed > 0.0:  # the next step is not to be refused for a leap
-            longest = min(longest, SAFETY * h / passed)
-        is_implicit = isinstance(begin.method, Rosenbrock)
-        counts_attempt = self._chooses and (is_implicit or not step.last)
-        attempts = begin.attempts + 1 if counts_attempt else begin.attempts
-        end = Point(
-            end.y, end.z, end.joints, begin.method, longest, attempts, end.steps,
-            begin.changes,
-        )  # fmt: skip
-        if counts_attempt:
-            end = self._choose_method(step.steps, step.t + h, h, end, step.drive, 0)
-        return step._replace(end=end)
 
     def _choose_method(
         self,
@@ -624,9 +644,56 @@ class Stepper:
             return step
         self.budget.charge(step.cost)
         outcome = step.steps.pair(step.t, x, step.begin, step.drive, step.other)
-        after = outcome.point
-        end = step.end._replace(y=after.y, z=after.z, joints=after.joints)
+        end = step.end._replace(y=outcome.y, z=outcome.z, joints=outcome.joints)
         return step._replace(h=x, end=end, last=False, stages=outcome.stages)
+
+
+def plan_length(
+    begin: Point, h: float, error: float, passed: float, *, is_cut: bool
+) -> float:
+    """Return the longest next step [s] after an accepted one.
+
+    Args:
+        begin: where that one began.
+        h: its length [s].
+        error: its local error relative to the tolerance.
+        passed: largest share of a change of friction that it has passed over.
+        is_cut: whether it is shorter than the error allows.
+
+    """
+    longest = h * step_factor(error, begin.method)
+    if is_cut:  # it does not say that the next must be shorter than allowed before
+        longest = max(begin.h, longest)
+    if passed > 0.0:  # the next step is not to be refused for a leap
+        longest = min(longest, SAFETY * h / passed)
+    return longest
+
+
+def end_of(
+    begin: Point, outcome: Outcome, longest: float, *, counts_attempt: bool
+) -> Point:
+    """Return where an accepted step ends.
+
+    Args:
+        begin: where it began.
+        outcome: what it has given.
+        longest: length of the next step at most [s].
+        counts_attempt: whether it counts among those after which `auto` looks at the
+            method.
+
+    """
+    attempts = begin.attempts + 1 if counts_attempt else begin.attempts
+    # a call of `_replace` takes three times as long
+    return Point(
+        outcome.y,
+        outcome.z,
+        outcome.joints,
+        begin.method,
+        longest,
+        attempts,
+        begin.steps + 1,
+        begin.changes,
+    )
 
 
 def methods_of(name: str) -> tuple[Method, ...]:

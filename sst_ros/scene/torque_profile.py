@@ -57,7 +57,7 @@ def ascend(times: Array) -> bool:
     """Return whether times are finite and ascending, shape (n,)."""
     if times.ndim != 1:
         return False
-    return bool(np.isfinite(times).all() and (np.diff(times) > 0.0).all())
+    return bool(np.isfinite(times).all() and (times[1:] > times[:-1]).all())
 
 
 class TorqueProfile(ReadOnly):

@@ -400,5 +400,7 @@ def _divide_evenly(samples: int | None, span_ns: int, period: int | None) -> Arr
         requirement = f"must be a whole number from 1 to {_MOST_SAMPLES}"
         if not 1 <= count <= _MOST_SAMPLES:
             _refuse("samples", samples, requirement)
-        even_ns = np.unique(np.rint(np.linspace(0, span_ns, count + 1)))
+        even_ns = np.rint(np.linspace(0, span_ns, count + 1))
+        if count > span_ns:  # less than a nanosecond apart
+            even_ns = np.unique(even_ns)
     return np.asarray(even_ns / NANOSECONDS)

@@ -22,7 +22,8 @@ from sst_ros.errors import (
     StepBudgetExceeded,
     StrokeExceeded,
 )
-from sst_ros.integration.method_steps import MethodSteps
+from sst_ros.integration.method_steps import PERIODS_AT_ONCE, MethodSteps
+from sst_ros.integration.stepper import Stepper
 from sst_ros.scene.bodies import Inertia, Link, Workspace
 from sst_ros.scene.loads import Friction, Initial, JointFriction
 from sst_ros.scene.scene import load
@@ -199,6 +200,41 @@ def test_the_bits_do_not_depend_on_how_many_ticks_go_into_a_call(name):
     single = run_ticks(scene, 1, 120, **how)
     for at_once in (20, 60):
         assert run_ticks(scene, at_once, 120, **how) == single
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_ticks_of_random_runs_may_go_into_any_number_of_calls(seed):
+    rng = np.random.default_rng(seed)
+    scene = load(str(rng.choice(["swing", "example2_heavy", "elastic_stops"])))
+    torque = tuple(rng.uniform(-3.0, 3.0, 3).tolist())
+    tick = int(10 ** rng.uniform(4, 7.3))
+    how = {
+        "integrator": str(rng.choice(["auto", "dopri5", "dop853", "rk4"])),
+        "tolerance": 10 ** rng.uniform(-13, -5),
+        "step_budget": int(10 ** rng.uniform(1.3, 4)),
+    }
+    ends = []
+    for most in (1, 16, 17, 64, 200):
+        simulation = Simulation(scene, **how)
+        stop = None
+        left = 200
+        while left and stop is None:
+            count = min(most, left)
+            try:
+                simulation.steps(torque, tick, count)
+            except RunStopped as error:
+                stop = type(error), str(error), error.time
+            left -= count
+        # what a refused period has spent is charged, too
+        ends.append((told(simulation), stop, simulation.evaluations))
+    assert ends == ends[:1] * len(ends)
+
+
+def test_even_ticks_need_no_loop_of_their_own(monkeypatch):
+    simulation = Simulation("swing")
+    monkeypatch.delattr(Stepper, "advance")
+    simulation.steps((0.1, 0.0, 0.0), MILLISECOND, 4 * PERIODS_AT_ONCE)
+    assert simulation.accepted_steps == 4 * PERIODS_AT_ONCE
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -124,7 +124,7 @@ class Bench:
     """
 
     def __init__(
-        self, scene="example1", build=Simulation, clock=None, commands=(), **given
+        self, scene="swing", build=Simulation, clock=None, commands=(), **given
     ):
         speed = 0.0 if clock is None else 1.0
         given = {"real_time_factor": speed, "command_timeout": 0.0, **given}

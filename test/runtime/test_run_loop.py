@@ -105,7 +105,7 @@ def test_a_free_run_passes_over_samples_that_nothing_receives(at_once):
     stamps = bench.output.stamps
     assert (stamps[-1] - stamps[0], bench.loop.counters.ticks) == (200_000_000, 200)
     assert len(stamps) < bench.loop.counters.published == 101
-    simulation = Simulation("example1")
+    simulation = Simulation("swing")
     simulation.steps(ZERO, 1_000_000, 200)
     assert bench.output.samples[-1][1] == simulation.state
 
@@ -197,7 +197,7 @@ def test_reset_goes_back_and_stamps_go_on(start):
     bench.ask("pause", True)
     last = output.stamps[-1]
     assert bench.ask("reset") == (True, "at the initial state, paused")
-    initial = Simulation("example1").state
+    initial = Simulation("swing").state
     assert bench.loop.simulation.state == initial
     output.now = 0  # no time: cannot begin
     assert "no time yet" in bench.ask("step").message
@@ -253,7 +253,7 @@ def test_a_fault_among_ticks_done_at_once_ends_a_run():
 
 
 def test_set_state_is_checked(start):
-    bench = start(wait_for_command=True)
+    bench = start("example1", wait_for_command=True)
     given = (0.6, 0.7, 0.8), (0.1, 0.0, -0.1)
     assert bench.ask("set_state", *given) == (True, "the state is set, waiting")
     joints = bench.loop.simulation.state.joints
