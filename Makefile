@@ -14,7 +14,7 @@ INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --no-compile
 # Where the environment forbids to keep it, each of some hundred processes compiles NumPy anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo demo-feedforward demo-identify demo-sweep docs paper view test test-all test-jazzy test-ros test-slow lint lint-style lint-types lint-words format clean
+.PHONY: help demo demo-feedforward demo-identify demo-sweep docs paper view test test-all test-jazzy test-ros test-search test-slow lint lint-style lint-types lint-words format clean
 
 help:  ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-18s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -56,12 +56,15 @@ test-ros: $(VENV)/.ros  ## run the tests of the nodes
 
 # By path: pytest would leave the files with few tests, whose tests are the longest, for the end, to one processor.
 test-slow: $(VENV)/.test $(VENV)/.docs  ## run the slow tests: sweeps, long pages, packages, fresh environments
-	$(PYTEST) $(PARALLEL) --no-loadscope-reorder -m slow --ignore test/ros --timeout 600
-	$(PYTEST) $(PARALLEL) -m "slow or breadth" test/ros --timeout 600
+	$(PYTEST) $(PARALLEL) --no-loadscope-reorder -m "slow and not search" --ignore test/ros --timeout 600
+	$(PYTEST) $(PARALLEL_NODES) -m "slow or breadth" test/ros --timeout 600
+
+test-search: $(VENV)/.test  ## run the random searches: proofs of hundreds of scenes, fits of hundreds of recordings
+	$(PYTEST) $(PARALLEL) --no-loadscope-reorder -m search
 
 # Lines and branches that the tests without nodes pass, those of child processes not counted.
 test-all: COVERAGE = --cov sst_ros --cov-branch --cov-report term
-test-all: test test-slow test-jazzy  ## run all tests, and print which share of lines and branches they pass
+test-all: test test-slow test-jazzy  ## run all tests but the random searches, and print which share of lines and branches they pass
 
 lint: $(VENV)/.test  ## check style and types
 	@$(MAKE) --no-print-directory --jobs --keep-going --output-sync lint-style lint-types lint-words

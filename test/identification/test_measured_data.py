@@ -62,6 +62,7 @@ def errors(case, seeds):
 
 
 @pytest.mark.slow
+@pytest.mark.search
 @pytest.mark.timeout(1200)
 def test_95_percent_intervals_cover_200_recordings():
     """Each base parameter in 90 to 99 % of the recordings.

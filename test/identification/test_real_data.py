@@ -30,6 +30,7 @@ from studies.coverage import (
 
 
 @pytest.mark.slow
+@pytest.mark.search
 @pytest.mark.timeout(1800)
 def test_95_percent_intervals_cover_93_to_97_percent_of_truths(tmp_path):
     """200 data sets with noise, delay, friction: all base parameters and the delay."""

@@ -28,7 +28,8 @@ from slow_cases import slow_except
 
 TIMES = [0.03125, 0.0625]  # [s], exact as doubles
 CORNERS, INSIDE = 20, 5
-MORE = range(12, 36)  # scenes of the slow test, of 300
+FEW = range(8)  # scenes of tests of their own
+MORE = range(8, 48)  # scenes of the search, of 300
 KINDS = ("converted", "ranges", "kinks")
 FAMILY = 2511  # of the seeds that these tests take
 QUICK = (6,)
@@ -316,7 +317,7 @@ def compare(number, folder, corners=CORNERS, inside=INSIDE, family=FAMILY):
     }
 
 
-@pytest.mark.parametrize("number", slow_except(QUICK, range(12)))
+@pytest.mark.parametrize("number", slow_except(QUICK, FEW))
 def test_a_true_motion_lies_inside(number, tmp_path):
     pytest.importorskip("flint")
     found = compare(number, tmp_path, corners=4, inside=1)
@@ -365,6 +366,7 @@ def summarize(rows):
 
 
 @pytest.mark.slow
+@pytest.mark.search
 @pytest.mark.timeout(1800)
 def test_true_motions_of_more_scenes_lie_inside(tmp_path):
     """All 300 scenes take most of an hour: run this file as a program."""

@@ -95,6 +95,7 @@ def test_a_random_corner_lies_inside(number):
 
 
 @pytest.mark.slow
+@pytest.mark.search
 @pytest.mark.timeout(3600)
 def test_all_random_corners_lie_inside():
     found = [compare(number) for number in range(COUNT)]

@@ -79,6 +79,7 @@ def test_a_random_motion_lies_inside(number):
 
 
 @pytest.mark.slow
+@pytest.mark.search
 @pytest.mark.timeout(3600)
 def test_all_random_motions_lie_inside():
     found = np.array([compare(number) for number in range(COUNT)])
