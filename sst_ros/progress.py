@@ -21,8 +21,10 @@ class Bar:
 
     def draw(self, share: float, text: str = "") -> None:
         """Show that this share is done, from 0 to 1, and a text."""
+        if not self._visible:
+            return
         percent = int(100.0 * share)
-        if not self._visible or percent == self._percent:
+        if percent == self._percent:
             return
         self._percent = percent
         bar = "#" * (40 * percent // 100)

@@ -422,28 +422,63 @@ class ParameterColumns(NamedTuple):
 class ParametricModel:
     """The programs of a scene whose inputs are the numbers that differ, `names`.
 
-    With `profile` the scene's own torques act. `ode` has the names of the state and the
-    drive.
+    `ode` has the names of the state and the drive. Models that are equal have the same
+    programs.
+
+    Args:
+        scene: what is simulated.
+        profile: whether the scene's own torques act.
+        constants: of the programs; of those that differ any numbers.
+        varied: places of the constants that differ.
+
     """
 
-    def __init__(self, scenarios: Scenarios, *, profile: bool) -> None:
-        self.scene = scenarios.document
+    def __init__(
+        self,
+        scene: Scene,
+        profile: bool,
+        constants: Constants,
+        varied: tuple[Place, ...],
+    ) -> None:
+        self.scene = scene
         self.profile = profile
-        self._scenarios = scenarios
-        self._tree, _, _ = self._constants_of(scenarios)
-        self._varied: list[Place] = []
-        self._fixed: dict[Place, float] = {}
-        for place, number in leaves(self._tree).items():
-            if np.max(number) != np.min(number):
-                self._varied.append(place)
-            else:
-                self._fixed[place] = float(np.ravel(number)[0])
-        self.names = parameter_symbols(len(self._varied))
-        self.ode = ODE(Dynamics.of(self.scene), self.scene.torque if profile else None)
+        self._constants = constants
+        self._varied = varied
+        self._fixed: dict[Place, float] = leaves(constants)
+        for place in varied:
+            del self._fixed[place]
+        self.names = parameter_symbols(len(varied))
+        self.ode = ODE(Dynamics.of(scene), scene.torque if profile else None)
+
+    @classmethod
+    def of(cls, scenarios: Scenarios, *, profile: bool) -> ParametricModel:
+        """Make the model of scenarios: what differs between them are its inputs."""
+        scene = scenarios.document
+        columns, _, _ = _constants_of(scene, scenarios, profile=profile)
+        numbers: dict[Place, float] = {}
+        varied = []
+        for place, column in leaves(columns).items():
+            numbers[place] = float(np.ravel(column)[0])
+            if np.max(column) != np.min(column):
+                varied.append(place)
+                numbers[place] = 0.0
+        return cls(scene, profile, rebuild(columns, numbers), tuple(varied))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the scenarios: programs are traced again."""
-        return partial(ParametricModel, profile=self.profile), (self._scenarios,)
+        """Pickle what was given: programs are traced again."""
+        return ParametricModel, self._arguments
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ParametricModel) and (
+            self._arguments == other._arguments
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._arguments)
+
+    @property
+    def _arguments(self) -> tuple[Any, ...]:
+        return self.scene, self.profile, self._constants, self._varied
 
     def columns(self, scenarios: Scenarios) -> ParameterColumns:
         """Return the numbers of scenarios.
@@ -451,7 +486,9 @@ class ParametricModel:
         Refused are numbers that differ and are fixed in this model, and actuators that
         cannot give the torques of the profile.
         """
-        tree, geometries, geometry_index = self._constants_of(scenarios)
+        tree, geometries, geometry_index = _constants_of(
+            self.scene, scenarios, profile=self.profile
+        )
         numbers = leaves(tree)
         inputs = np.empty((len(self._varied), len(geometry_index)))
         for row, place in zip(inputs, self._varied, strict=True):
@@ -540,26 +577,27 @@ class ParametricModel:
     def constants(self, inputs: Sequence[Any]) -> Constants:
         """Return the constants, with expressions or columns where they differ."""
         varied = dict(zip(self._varied, map(mark_present, inputs), strict=True))
-        tree: Constants = rebuild(self._tree, self._fixed | varied)
+        tree: Constants = rebuild(self._constants, self._fixed | varied)
         return tree
 
-    def _constants_of(
-        self, scenarios: Scenarios
-    ) -> tuple[Constants, Geometry, NDArray[np.intp]]:
-        """Return constants of scenarios, as columns, and their distinct geometries.
 
-        The last of the three results is the index of each row's geometry.
-        """
-        geometries, geometry_index = Geometry.of_scenarios(scenarios)
-        geometry = geometries.of_rows(geometry_index)
-        columns = scenarios.columns()
-        limits = limits_of(self.scene, geometry)
-        ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
-        # The rest of springs without stiffness is 0/0.
-        with np.errstate(invalid="ignore"):
-            model = kernel.model_of(columns, geometry)
-        torque = columns.torque if self.profile else None
-        return Constants(model, ends, torque), geometries, geometry_index
+def _constants_of(
+    scene: Scene, scenarios: Scenarios, *, profile: bool
+) -> tuple[Constants, Geometry, NDArray[np.intp]]:
+    """Return constants of scenarios, as columns, and their distinct geometries.
+
+    The last of the three results is the index of each row's geometry.
+    """
+    geometries, geometry_index = Geometry.of_scenarios(scenarios)
+    geometry = geometries.of_rows(geometry_index)
+    columns = scenarios.columns()
+    limits = limits_of(scene, geometry)
+    ends = tuple((np.cos(limit.end), np.sin(limit.end)) for limit in limits)
+    # The rest of springs without stiffness is 0/0.
+    with np.errstate(invalid="ignore"):
+        model = kernel.model_of(columns, geometry)
+    torque = columns.torque if profile else None
+    return Constants(model, ends, torque), geometries, geometry_index
 
 
 def _check_limit(scenarios: Scenarios, torque: SineTorque, limit: Array) -> Check:

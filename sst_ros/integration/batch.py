@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -143,7 +143,7 @@ class Batch(Explained):
         self._method = method
         self._scenarios = Scenarios(scene, parameters or {})
         self._scenarios.check()
-        self.model = ParametricModel(self._scenarios, profile=profile)
+        self.model = ParametricModel.of(self._scenarios, profile=profile)
         self.columns = self.model.columns(self._scenarios)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -392,7 +392,13 @@ class Batch(Explained):
     @cached_property
     def programs(self) -> ColumnStep:
         """The programs of a step, compiled when they are first needed."""
-        return ColumnStep(self.model, self._method)
+        return _programs_of(self.model, self._method)
+
+
+@lru_cache(maxsize=16)
+def _programs_of(model: ParametricModel, method: Tableau) -> ColumnStep:
+    """Return the programs of a step, traced once for all batches of the same model."""
+    return ColumnStep(model, method)
 
 
 def block_width(number: int, threads: int = 1) -> int:

@@ -130,6 +130,25 @@ def alone(scene, gamma, gamma_dot, torque, tick_ns, count):
     return simulation.state, "reached the end", None
 
 
+def test_programs_are_shared_where_all_that_is_fixed_is_equal():
+    zz = EXAMPLE2.star.inertia.zz
+    varied = {"star.inertia.zz": [zz, 1.1 * zz]}
+    batch = Batch(EXAMPLE2, parameters=varied)
+    again = load_scene("example2_heavy")
+    more = {"star.inertia.zz": [1.2 * zz, 0.9 * zz, zz]}
+    assert Batch(again, parameters=more).programs is batch.programs
+    assert copy.deepcopy(batch).programs is batch.programs
+    others = [
+        Batch(EXAMPLE2, DORMAND_PRINCE, parameters=varied),
+        Batch(EXAMPLE2, profile=True, parameters=varied),
+        Batch(EXAMPLE2, parameters={**varied, "star.inertia.yy": [zz, 1.1 * zz]}),
+        Batch(EXAMPLE2.with_values({"star.inertia.xx": 1.1 * zz}), parameters=varied),
+        Batch(EXAMPLE2.with_values({"stroke.at_end": "ignore"}), parameters=varied),
+        Batch(load_scene("gravity_payload"), parameters=varied),
+    ]
+    assert batch.programs not in [other.programs for other in others]
+
+
 @pytest.mark.parametrize("n", [*range(0, FEW, 2), 7])
 def test_a_scenario_equals_a_run_of_its_own(rows, n):
     torque = EXAMPLE2.torque.at if rows.torque is None else tuple(rows.torque[n])
