@@ -4,7 +4,8 @@
 `steps.py` has the steps as ordinary functions. Here they are traced, as programs that
 call the derivative of the scene, and become machine code where llvmlite is installed,
 else flat Python with the same bits. Torques that are numbers, or a function of time, go
-in as inputs; see `function_steps.py`.
+in as inputs; see `function_steps.py`. Beside one step of both solutions, `pair`, there
+are those of several equal periods, `periods`.
 """
 
 from __future__ import annotations

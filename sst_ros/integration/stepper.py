@@ -12,6 +12,8 @@
 5. A step does not leap over the rates within which Coulomb friction changes its sign.
 6. A limit ends the motion by LimitReached. Where no step resolves the motion,
    CannotStep ends it.
+7. Equal periods that take one step each, in which nothing happens, are done several in
+   one call: `advance_evenly`, with the bits of `advance`.
 
 What a step computes is in `steps.py`; what it starts from and ends with is a `Point`.
 """
