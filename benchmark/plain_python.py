@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from sst_ros.dynamics import traced_dynamics
+from sst_ros.integration.batch import programs_of
 from sst_ros.integration.function_steps import (
     compile_by_stage,
     compile_rows_by_stage,
@@ -23,6 +24,7 @@ _CACHED: tuple[Any, ...] = (
     compile_by_stage,
     compile_rows_by_stage,
     compile_stages,
+    programs_of,
 )
 """What keeps functions that are machine code or not."""
 

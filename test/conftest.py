@@ -13,6 +13,8 @@ import hypothesis
 import pytest
 
 from sst_ros.dynamics import kernel, traced_dynamics
+from sst_ros.integration import batch
+from sst_ros.programs import llvm
 from sst_ros.scene import scene
 
 # By its default an example of 0.2 s is a failure: on a loaded machine any may take that
@@ -104,9 +106,25 @@ def wrong_kernel(monkeypatch):
     """
     right = kernel.derivative
 
+    def forget():
+        traced_dynamics.recent.cache_clear()
+        batch.programs_of.cache_clear()
+
     def put(wrong):
         monkeypatch.setattr(kernel, "derivative", lambda *given: wrong(right(*given)))
-        traced_dynamics.recent.cache_clear()
+        forget()
 
     yield put
-    traced_dynamics.recent.cache_clear()
+    forget()
+
+
+@pytest.fixture
+def without_machine_code(monkeypatch):
+    """Let batches that are made from now on compute by NumPy, as without llvmlite."""
+
+    def begin():
+        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+        batch.programs_of.cache_clear()
+
+    yield begin
+    batch.programs_of.cache_clear()

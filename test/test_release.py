@@ -62,7 +62,7 @@ def test_the_page_of_the_release_in_a_clone(tmp_path):
     )
     shutil.copytree(ROOT, source, ignore=ignored)
     commands = [line.strip() for step in STEPS for line in step.splitlines()]
-    assert len(commands) == 28 and sum(not dry(command) for command in commands) == 8
+    assert len(commands) == 29 and sum(not dry(command) for command in commands) == 8
     git = [
         "git init --quiet",
         "git add --all",

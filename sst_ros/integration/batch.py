@@ -392,11 +392,11 @@ class Batch(Explained):
     @cached_property
     def programs(self) -> ColumnStep:
         """The programs of a step, compiled when they are first needed."""
-        return _programs_of(self.model, self._method)
+        return programs_of(self.model, self._method)
 
 
 @lru_cache(maxsize=16)
-def _programs_of(model: ParametricModel, method: Tableau) -> ColumnStep:
+def programs_of(model: ParametricModel, method: Tableau) -> ColumnStep:
     """Return the programs of a step, traced once for all batches of the same model."""
     return ColumnStep(model, method)
 

@@ -25,7 +25,6 @@ from sst_ros.integration.batch import Batch
 from sst_ros.integration.method_steps import MethodSteps
 from sst_ros.integration.methods import DOP853, DORMAND_PRINCE
 from sst_ros.integration.point import Drive
-from sst_ros.programs import llvm
 from sst_ros.programs.expression import compile_program
 from sst_ros.programs.llvm import LANES
 from sst_ros.scene.loads import Initial, Moment
@@ -210,8 +209,8 @@ def test_a_scenario_has_the_bits_of_steps_of_its_own(rows):
         assert ended == [*result.quaternion[n], *result.body_rate[n]]
 
 
-def test_numpy_has_the_bits_of_machine_code(rows, monkeypatch):
-    monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+def test_numpy_has_the_bits_of_machine_code(rows, without_machine_code):
+    without_machine_code()
     plain = rows._replace(batch=copy.copy(rows.batch))
     plain.batch.__dict__.pop("programs", None)
     found = plain.run(threads=1)

@@ -9,7 +9,6 @@ from slow_cases import slow_after
 
 from sst_ros import Batch, Simulation, load_scene
 from sst_ros.errors import InputError
-from sst_ros.programs import llvm
 from sst_ros.scene.loads import Initial
 
 SCENE = replace(load_scene("example2_heavy"), torque=None)
@@ -21,9 +20,9 @@ def starts(number):
 
 
 @pytest.mark.parametrize("by", ["machine code", "NumPy"])
-def test_steps_have_the_bits_of_a_run_and_of_a_simulation(by, monkeypatch):
+def test_steps_have_the_bits_of_a_run_and_of_a_simulation(by, without_machine_code):
     if by == "NumPy":
-        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+        without_machine_code()
     gamma, torque = starts(5), (0.3, -0.2, 0.1)
     batch = Batch(SCENE)
     session = batch.start(gamma, step=2e-3)
@@ -107,9 +106,11 @@ def test_a_batch_with_its_own_torques_takes_no_others():
 
 
 @pytest.mark.parametrize("by", ["machine code", "NumPy"])
-def test_robots_that_begin_again_have_the_bits_of_a_new_session(by, monkeypatch):
+def test_robots_that_begin_again_have_the_bits_of_a_new_session(
+    by, without_machine_code
+):
     if by == "NumPy":
-        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+        without_machine_code()
     number = 1500 if by == "machine code" else 40
     gamma, later = starts(number), starts(number)[::-1] + 0.01
     rows = np.arange(3, number, 7)

@@ -11,7 +11,6 @@ from sst_ros.control.controller import Controller, Measurement, TrackingMetrics
 from sst_ros.control.law import MODES, ControlChannel, ControllerSettings
 from sst_ros.dynamics.traced_dynamics import Dynamics
 from sst_ros.errors import InputError
-from sst_ros.programs import llvm
 from sst_ros.sweeps.controlled_batch import (
     ControlledBlock,
     normal_number,
@@ -54,9 +53,11 @@ def gaussian(seed, rows, counter):
 @pytest.mark.parametrize(
     "case", slow_after(1, CASES), ids=lambda case: "-".join(map(str, case.values()))
 )
-def test_each_torque_is_that_of_the_python_controller(monkeypatch, case, by):
+def test_each_torque_is_that_of_the_python_controller(
+    monkeypatch, without_machine_code, case, by
+):
     if by == "NumPy":
-        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
+        without_machine_code()
     else:
         pytest.importorskip("llvmlite", reason="needs llvmlite: pip install .[fast]")
     study = SweepStudy(
