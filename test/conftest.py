@@ -7,14 +7,15 @@ import os
 # the cores.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import contextlib
 import itertools
 
 import hypothesis
 import pytest
 
+from benchmark.plain_python import without_llvmlite
 from sst_ros.dynamics import kernel, traced_dynamics
 from sst_ros.integration import batch
-from sst_ros.programs import llvm
 from sst_ros.scene import scene
 
 # By its default an example of 0.2 s is a failure: on a loaded machine any may take that
@@ -119,12 +120,7 @@ def wrong_kernel(monkeypatch):
 
 
 @pytest.fixture
-def without_machine_code(monkeypatch):
-    """Let batches that are made from now on compute by NumPy, as without llvmlite."""
-
-    def begin():
-        monkeypatch.setattr(llvm, "llvmlite_version", lambda: None)
-        batch.programs_of.cache_clear()
-
-    yield begin
-    batch.programs_of.cache_clear()
+def without_machine_code():
+    """Run what is made from the call on as without llvmlite, to the end of the test."""
+    with contextlib.ExitStack() as stack:
+        yield lambda: stack.enter_context(without_llvmlite())

@@ -458,10 +458,11 @@ class ParametricModel:
         numbers: dict[Place, float] = {}
         varied = []
         for place, column in leaves(columns).items():
-            numbers[place] = float(np.ravel(column)[0])
             if np.max(column) != np.min(column):
                 varied.append(place)
                 numbers[place] = 0.0
+            else:
+                numbers[place] = float(np.ravel(column)[0])
         return cls(scene, profile, rebuild(columns, numbers), tuple(varied))
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -18,7 +18,6 @@ leaves and comes back.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from functools import reduce
 from operator import add
@@ -31,7 +30,7 @@ from sst_ros.dynamics.model import GRAZING
 from sst_ros.dynamics.traced_dynamics import ParametricModel
 from sst_ros.integration.many_runs import stop_if_asked
 from sst_ros.integration.methods import Tableau
-from sst_ros.integration.steps import explicit_step, normalise
+from sst_ros.integration.steps import explicit_step, is_not_finite, normalise
 from sst_ros.mechanism.generic_math import (
     Scalar,
     absolute,
@@ -430,11 +429,6 @@ def share_of_crossing(
         low = select(outside, low, middle)
         high = select(outside, middle, high)
     return (select(-GRAZING - least, high, _NO_SHARE),)
-
-
-def is_not_finite(x: Scalar) -> Scalar:
-    """Return 1 where a number is not finite, else 0."""
-    return select(sys.float_info.max - absolute(x), 0.0, 1.0)
 
 
 def fill(rows: NDArray[Any], values: NDArray[Any]) -> None:

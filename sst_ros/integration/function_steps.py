@@ -19,17 +19,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 
-from sst_ros.dynamics.traced_dynamics import LEGS, ODE, STATE_SIZE
+from sst_ros.dynamics.traced_dynamics import LEGS, ODE
 from sst_ros.integration.applied_torque import AppliedTorque
 from sst_ros.integration.events import JointRanges, largest_overshoot
 from sst_ros.integration.method_steps import (
-    JOINT_NUMBERS,
+    JOINTS,
     STEP_LENGTH,
     count_step_outputs,
     lagged_torques,
     pair_outputs,
     read_outcome,
     step_cost,
+    trace_outputs,
     trace_overshoot,
     trace_steps,
 )
@@ -582,8 +583,6 @@ def trace_stages(
     `trace_steps`.
     """
     slope = Routine("slope", 1 + size + drive, size)
-    joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
-    overshoot_of = Routine("overshoot", 1 + 2 * JOINT_NUMBERS, 1)
     stages = len(method.a)
     end_size = count_step_outputs(method, size)
 
@@ -596,7 +595,7 @@ def trace_stages(
         if number == stages - 1:
             return (*own_slope, *end_step(method, h, y, slopes).numbers())
         next_point = move(y, h, method.a[number + 1], slopes)
-        return (*own_slope, *next_point, *joints(*next_point[STAR]))
+        return (*own_slope, *next_point, *JOINTS(*next_point[STAR]))
 
     def end_pair(h: Any, *inputs: Any) -> tuple[Any, ...]:
         y = inputs[:size]
@@ -605,9 +604,7 @@ def trace_stages(
         first = NewState.of(y_end, size)
         second = NewState.of(z_end, size)
         pair = compare(h, y, z, first, second, lagged)
-        end_joints = joints(*pair.y[STAR])
-        (overshoot,) = overshoot_of(h, *joints(*y[STAR]), *end_joints)
-        return pair_outputs(pair, end_joints, overshoot)
+        return trace_outputs(pair, h, y)
 
     programs = {}
     for number in range(stages):

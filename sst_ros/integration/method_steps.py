@@ -11,7 +11,6 @@ are those of several equal periods, `periods`.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -28,11 +27,12 @@ from sst_ros.integration.steps import (
     Pair,
     add_up,
     explicit_step,
+    is_not_finite,
     normalise,
     rosenbrock_step,
     step_pair,
 )
-from sst_ros.mechanism.generic_math import absolute, rows_of, select
+from sst_ros.mechanism.generic_math import rows_of, select
 from sst_ros.mechanism.geometry import Array
 from sst_ros.programs.compiled import (
     RowsFunction,
@@ -49,7 +49,9 @@ JACOBIAN_COST = 30
 JOINT_NUMBERS = 2 * JOINT_COUNT
 """Numbers of `joints`: the angles and their rates."""
 
-_LARGEST = sys.float_info.max
+JOINTS = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
+_OVERSHOOT = Routine("overshoot", 1 + 2 * JOINT_NUMBERS, 1)
+"""Programs that others call: joints of a star, and `trace_overshoot`."""
 
 PERIODS_AT_ONCE = 16
 """Periods of one call of `periods`: its own cost is then a small part of theirs."""
@@ -318,7 +320,7 @@ def trace_periods(size: int, drive: int) -> Program:
             results = pair(0.0, h, *solutions, *drive_numbers, *drive_numbers)
             *ends, error, total, overshoot = results
             is_plain = select(tolerance - error, is_plain, 0.0)
-            is_plain = select(_LARGEST - absolute(total), is_plain, 0.0)
+            is_plain = select(is_not_finite(total), 0.0, is_plain)
             is_plain = select(-overshoot, is_plain, 0.0)
             count = count + is_plain
             sizes.append(error)
@@ -353,8 +355,6 @@ class _StepTracer:
         self.point_size = size if isinstance(method, Rosenbrock) else 0
         self.drive_size = drive * len(method.a) if by_stage else drive
         self._slope = Routine("slope", 1 + size + drive, size)
-        self._joints = Routine("joints", STATE_SIZE, JOINT_NUMBERS)
-        self._overshoot = Routine("overshoot", 1 + 2 * JOINT_NUMBERS, 1)
         step_inputs = 2 + size + self.point_size + self.drive_size
         self._step = Routine("step", step_inputs, count_step_outputs(method, size))
 
@@ -398,9 +398,7 @@ class _StepTracer:
             return NewState.of(results, size)
 
         pair = step_pair(call, t, h, y, z, self._lagged)
-        joints = self._joints(*pair.y[STAR])
-        (overshoot,) = self._overshoot(h, *self._joints(*y[STAR]), *joints)
-        return pair_outputs(pair, joints, overshoot)
+        return trace_outputs(pair, h, y)
 
     def take_single(self, t: Any, h: Any, *inputs: Any) -> tuple[Any, ...]:
         """Return the new state."""
@@ -449,6 +447,16 @@ def pair_outputs(pair: Pair, joints: Sequence[Any], overshoot: Any) -> tuple[Any
     """
     total = pair.total + add_up(joints)
     return (*pair.y, *pair.z, *joints, pair.size, total, overshoot)
+
+
+def trace_outputs(pair: Pair, h: Any, y: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the outputs of `pair` after a step of h from y.
+
+    They are traced, as calls of the programs `joints` and `overshoot`.
+    """
+    joints = JOINTS(*pair.y[STAR])
+    (overshoot,) = _OVERSHOOT(h, *JOINTS(*y[STAR]), *joints)
+    return pair_outputs(pair, joints, overshoot)
 
 
 def read_outcome(

@@ -349,11 +349,13 @@ class Stepper:
             few, or the first takes more than that.
 
         """
-        if count < PERIODS_AT_ONCE or isinstance(point.method, Rosenbrock):
+        if count < PERIODS_AT_ONCE or self._transitions:
+            return point, 0
+        if isinstance(point.method, Rosenbrock):
             return point, 0
         drive = self._drive_of(period)
         steps = self._steps_of(drive, point.method)
-        if not isinstance(steps, MethodSteps) or drive.sine or self._transitions:
+        if not isinstance(steps, MethodSteps) or drive.sine:
             return point, 0
         h = period.h
         cost = PAIR_STEPS * steps.cost

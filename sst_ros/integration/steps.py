@@ -7,6 +7,7 @@ program that runs as machine code: what is read here is what runs.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -345,6 +346,11 @@ def compare(
     size = size_of_error(error_y, y, new_y, h, lagged)
     total = add_up([*new_y, *error_y, *new_z, *(error_z or ())])
     return Pair(normalise(new_y), normalise(new_z), size, total)
+
+
+def is_not_finite(x: Number) -> Number:
+    """Return 1 where a number is not finite, else 0."""
+    return select(sys.float_info.max - absolute(x), 0.0, 1.0)
 
 
 def add_up(numbers: Numbers) -> Number:
