@@ -326,14 +326,15 @@ def test_the_recording_survives_a_killed_simulator_which_lets_go(
     states = observer.states
     recorder = nodes.run("recorder", output=bag)
     # Slowly: while a busy machine lets the controller wait, the manipulator hardly
-    # moves.
+    # moves. With little feedback: a torque that is held for long does not make it
+    # swing.
     slow = {"real_time_factor": 0.1, "command_timeout": 0.1}
     simulator = nodes.run("simulator", scene=path, wait_for_command=True, **slow)
     assert nodes.line(recorder).startswith("ready")
     # The recorder reads the commands and the reference before the run begins.
     waits = {"min_subscribers": 2, "wait_for_recorder": "true"}
     controller = nodes.run(
-        "inverse_dynamics", scene=path, mode="feedforward_pd", **waits
+        "inverse_dynamics", scene=path, mode="feedforward_pd", bandwidth=10.0, **waits
     )
     observer.until(lambda: len(reference) > 100, "the motion")
     controller.send_signal(signal.SIGKILL)
