@@ -735,7 +735,6 @@ def better_method(
 def bound_of_eigenvalues(matrix: Array) -> float:
     """Return a bound of all magnitudes of eigenvalues, at a fraction of their cost.
 
-    Both the largest sum of a row and that of a column are one.
+    It is the Frobenius norm, the root of the sum of all squares.
     """
-    sizes = np.abs(matrix)
-    return float(min(sizes.sum(axis=0).max(), sizes.sum(axis=1).max()))
+    return math.sqrt(np.vdot(matrix, matrix))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -292,6 +292,7 @@ def names() -> list[str]:
     )
 
 
+@cache  # each scene by name asks, and the installation stays where it is
 def share_directory() -> Path:
     """Return the folder that holds config/ and launch/.
 
