@@ -270,12 +270,13 @@ def test_a_recorder_that_was_held_up_has_all_commands(nodes, observer, tmp_path)
 
 def test_kill_of_the_simulator_leaves_a_whole_bag(nodes, observer, tmp_path):
     recorder, simulator = recorded(nodes, observer, tmp_path / "bag")
-    observer.told("samples_published", lambda n: int(n) > 300)
+    # What the recorder of a busy machine has not taken yet is lost with the simulator.
+    observer.told("samples_published", lambda n: int(n) > 1000)
     simulator.kill()
     simulator.communicate()
     assert nodes.stop(recorder)[0] == 0
     # The report says that it was cut.
-    assert whole(tmp_path / "bag", 300).diagnostics["phase"] == "running"
+    assert whole(tmp_path / "bag", 100).diagnostics["phase"] == "running"
 
 
 @pytest.mark.breadth
