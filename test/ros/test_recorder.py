@@ -276,7 +276,7 @@ def test_kill_of_the_simulator_leaves_a_whole_bag(nodes, observer, tmp_path):
     simulator.communicate()
     assert nodes.stop(recorder)[0] == 0
     # The report says that it was cut.
-    assert whole(tmp_path / "bag", 100).diagnostics["phase"] == "running"
+    assert whole(tmp_path / "bag", 300).diagnostics["phase"] == "running"
 
 
 @pytest.mark.breadth
