@@ -75,6 +75,7 @@ EXTRAS |= {
         "build",
         "casadi>=3.6.5",
         "catkin_pkg",  # for rosidl_adapter
+        "cmeel-eigen",  # headers of Pinocchio's C++; pin does not bring them
         "codespell",
         "colcon-common-extensions",
         "control",
