@@ -25,8 +25,10 @@ RUNS = {"kernel": ("--rounds", "1"), "batch": ("--scenarios", "200", "--rounds",
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_benchmark_runs(name, capsys):
+def test_a_benchmark_runs(name, capsys, monkeypatch):
     pytest.importorskip("llvmlite", reason="what is measured is compiled")
+    # gcc takes 18 s longer for DOP853
+    monkeypatch.setattr("benchmark.batch.METHODS", {"rk4": METHODS["rk4"]})
     assert importlib.import_module(f"benchmark.{name}").main([*RUNS[name]]) == 0
     assert "target" in capsys.readouterr().out
 
