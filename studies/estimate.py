@@ -300,6 +300,7 @@ def summarise(rows: DataFrame) -> DataFrame:
                 "stopped": (~compared).sum(),
                 "resolved": len(resolved),
                 **dict(zip(heads, quantiles, strict=True)),
+                "below 1": (ratios < 1).sum(),
                 "below 1/3": (ratios < 1 / 3).sum(),
                 "below 1/10": (ratios < 1 / 10).sum(),
                 "beyond 3 tolerances": beyond.sum(),

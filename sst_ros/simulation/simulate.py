@@ -78,7 +78,7 @@ _ADVICE = (
 _UNSEEN_ANSWER = 10.0
 """Factor of the error estimate where a controller's answer to the error is unknown.
 
-Of 170 random runs one has an error of more than ten times the estimate without it.
+It multiplies the largest of the errors that the controller has answered.
 """
 
 _METHOD_WORDS = "must be one of " + ", ".join(INTEGRATORS)
@@ -139,7 +139,8 @@ def simulate(
         memoryless: the function depends on its arguments alone. With `control_period`
             it is then called a second time a period, with the state of the second
             solution, which shows how it answers the error. Otherwise the error
-            estimate, without this answer, is ten times as large.
+            estimate, without this answer, is ten times the largest at the end of a
+            period.
         breaks: times at which a function jumps or has a kink [s], ascending. Jumps in
             time are found without it, but a pulse may be missed that lies between two
             of 32 even parts of a step, or changes less than 0.1 % of the largest torque
@@ -275,9 +276,14 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
         last_excess = excess
         step_tolerance = max(step_tolerance / (_RUN_MARGIN * excess), _FINEST)
     assert kept is not None
+    error = kept.point.error
     is_answer_unseen = remembers and task.torque.feedback
-    factor = _UNSEEN_ANSWER if is_answer_unseen else 1.0
-    return _make_trajectory(task, kept, budget.spent, factor=factor)
+    if is_answer_unseen:
+        # The torques answered earlier errors, too, which may have been larger.
+        error = _UNSEEN_ANSWER * max(error, kept.answered_error)
+    return _make_trajectory(
+        task, kept, budget.spent, error, is_answer_unseen=is_answer_unseen
+    )
 
 
 def _budget_of(task: Task) -> int:
@@ -290,14 +296,15 @@ def _budget_of(task: Task) -> int:
 
 
 def _make_trajectory(
-    task: Task, motion: SteppedMotion, spent: int, *, factor: float
+    task: Task,
+    motion: SteppedMotion,
+    spent: int,
+    error: float,
+    *,
+    is_answer_unseen: bool,
 ) -> Trajectory:
-    """Return a run as a trajectory.
-
-    Its error estimate is `factor` times that of the steps.
-    """
+    """Return a run as a trajectory, with its error estimate [rad]."""
     point = motion.point
-    error = factor * point.error
     message = motion.message
     if motion.status < 0:
         geometry = Geometry.of(task.scene)
@@ -305,8 +312,10 @@ def _make_trajectory(
         if task.period is None and task.torque.feedback:
             message += _ADVICE
     status, message = check_error(error, task.tolerance, motion.status, message)
-    if factor > 1.0 and error > task.tolerance:
-        message += f" ({factor:g} times wider, as the function may have a memory)"
+    if is_answer_unseen and error > task.tolerance:
+        message += (
+            f" ({_UNSEEN_ANSWER:g} times wider, as the function may have a memory)"
+        )
     samples = motion.samples.table()
     methods = [motion.start.method.name]
     for change in point.changes:

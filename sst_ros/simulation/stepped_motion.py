@@ -72,6 +72,8 @@ class SteppedMotion:
     Attributes:
         samples: those that were taken.
         held: times of control [s] and the torques from then on.
+        answered_error: largest estimated error of the states that a function with held
+            torques has answered [rad].
         start, point, time: first and last valid point, and time of the last [s].
         status, message: 0 at the end, 1 at a limit, -1 where no step resolves the
             motion; why.
@@ -99,6 +101,7 @@ class SteppedMotion:
         self.status = 0
         self.message = "reached the end"
         self.held: list[tuple[float, Vector3]] = []
+        self.answered_error = 0.0
         self.samples = Samples(self.stepper)
         self._times: list[float] = task.times.tolist()
         self._next = 0  # place of the next time
@@ -162,6 +165,7 @@ class SteppedMotion:
             time = start_ns / NANOSECONDS
             self._take_if_wanted(time, self.point.y)
             if task.torque.feedback:
+                self.answered_error = max(self.answered_error, self.point.error)
                 torque = task.torque.at(time, self.state())
             else:
                 torque = task.torque.at(time)
