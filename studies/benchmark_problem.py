@@ -12,11 +12,13 @@ from __future__ import annotations
 import argparse
 import time
 from functools import partial
+from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from benchmark.measure import time_in_turn
 from sst_ros.errors import InputError, Problem
 from sst_ros.mechanism import kinematics, virtual_work
 from sst_ros.mechanism.geometry import Array, Geometry, angle_between, quaternion_of
@@ -133,8 +135,8 @@ def data_file(problem: InitialValueProblem, reference: ReferenceSolution) -> str
 
 def solve_by_package(problem: InitialValueProblem, truth: Array) -> DataFrame:
     """Solutions of this package: error as the problem defines it, processor time."""
-    calls = [
-        partial(
+    calls: dict[tuple[str, float], Callable[[], Any]] = {
+        (method, tolerance): partial(
             simulate,
             problem.scene,
             method=method,
@@ -142,32 +144,19 @@ def solve_by_package(problem: InitialValueProblem, truth: Array) -> DataFrame:
             t_eval=problem.times,
         )
         for method, tolerance in SETTINGS
-    ]
-    # The first calls trace and compile.
-    solutions = [call() for call in calls]
-    # In turns, for the machine's speed changes.
-    times_ms = np.array(
-        [[1e3 * _processor_time(call) for call in calls] for _ in range(ROUNDS)]
-    )
+    }
+    solutions = {setting: call() for setting, call in calls.items()}
+    times = time_in_turn(calls, ROUNDS, shortest=0.02, clock=time.process_time)
     return data_frame(
         {
             "method": method,
             "tolerance [rad]": f"{tolerance:.0e}",
             "error [rad]": f"{angle_between(solution.quaternion, truth).max():.1e}",
             "evaluations": solution.evaluations,
-            "processor time [ms]": f"{time_ms:.3g}",
+            "processor time [ms]": f"{1e3 * median(times[method, tolerance]):.3g}",
         }
-        for (method, tolerance), solution, time_ms in zip(
-            SETTINGS, solutions, np.median(times_ms, axis=0), strict=True
-        )
+        for (method, tolerance), solution in solutions.items()
     )
-
-
-def _processor_time(call: Callable[[], object]) -> float:
-    """Time that a call takes of the processor [s]."""
-    began = time.process_time()
-    call()
-    return time.process_time() - began
 
 
 def report(options: argparse.Namespace) -> bool:

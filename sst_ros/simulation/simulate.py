@@ -256,7 +256,6 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
     run again and spends it is left out.
     """
     budget = EvaluationBudget(_budget_of(task), whole_run=True)
-    remembers = task.period is not None and not task.memoryless
     step_tolerance = task.tolerance
     kept: SteppedMotion | None = None
     last_excess = math.inf
@@ -271,19 +270,12 @@ def _run_to_tolerance(task: Task, *, progress: bool) -> Trajectory:
         excess = motion.point.error / task.tolerance
         is_met = not excess > 1.0
         gains_little = excess > _LEAST_GAIN * last_excess
-        if remembers or motion.status < 0 or is_met or gains_little:
+        if task.remembers or motion.status < 0 or is_met or gains_little:
             break
         last_excess = excess
         step_tolerance = max(step_tolerance / (_RUN_MARGIN * excess), _FINEST)
     assert kept is not None
-    error = kept.point.error
-    is_answer_unseen = remembers and task.torque.feedback
-    if is_answer_unseen:
-        # The torques answered earlier errors, too, which may have been larger.
-        error = _UNSEEN_ANSWER * max(error, kept.answered_error)
-    return _make_trajectory(
-        task, kept, budget.spent, error, is_answer_unseen=is_answer_unseen
-    )
+    return _make_trajectory(task, kept, budget.spent)
 
 
 def _budget_of(task: Task) -> int:
@@ -295,16 +287,14 @@ def _budget_of(task: Task) -> int:
     return max(WHOLE_MOTION_BUDGET, round(by_duration))
 
 
-def _make_trajectory(
-    task: Task,
-    motion: SteppedMotion,
-    spent: int,
-    error: float,
-    *,
-    is_answer_unseen: bool,
-) -> Trajectory:
-    """Return a run as a trajectory, with its error estimate [rad]."""
+def _make_trajectory(task: Task, motion: SteppedMotion, spent: int) -> Trajectory:
+    """Return a run as a trajectory."""
     point = motion.point
+    error = point.error
+    is_answer_unseen = task.remembers and task.torque.feedback
+    if is_answer_unseen:
+        # The torques answered earlier errors, too, which may have been larger.
+        error = _UNSEEN_ANSWER * max(error, motion.answered_error)
     message = motion.message
     if motion.status < 0:
         geometry = Geometry.of(task.scene)

@@ -57,6 +57,11 @@ class Task:
     max_step: float = math.inf  # longest step
     parameters: tuple[str, ...] = ()  # by which the motion is differentiated
 
+    @property
+    def remembers(self) -> bool:
+        """Whether its function may have a memory: it is called once a period."""
+        return self.period is not None and not self.memoryless
+
 
 class SteppedMotion:
     """One run of a task by steps whose local error is at most its tolerance.
@@ -72,8 +77,8 @@ class SteppedMotion:
     Attributes:
         samples: those that were taken.
         held: times of control [s] and the torques from then on.
-        answered_error: largest estimated error of the states that a function with held
-            torques has answered [rad].
+        answered_error: largest estimated error of the states that a function which may
+            have a memory has answered [rad].
         start, point, time: first and last valid point, and time of the last [s].
         status, message: 0 at the end, 1 at a limit, -1 where no step resolves the
             motion; why.
@@ -165,13 +170,14 @@ class SteppedMotion:
             time = start_ns / NANOSECONDS
             self._take_if_wanted(time, self.point.y)
             if task.torque.feedback:
-                self.answered_error = max(self.answered_error, self.point.error)
                 torque = task.torque.at(time, self.state())
             else:
                 torque = task.torque.at(time)
             self.held.append((time, torque))
             if task.torque.feedback and task.memoryless:
                 self._second_torque = self._answer_second(time)
+            elif task.torque.feedback:
+                self.answered_error = max(self.answered_error, self.point.error)
             stop_ns = min(start_ns + period, end_ns)
             # Not stop less start in seconds: rounding would make periods unequal.
             length = (stop_ns - start_ns) / NANOSECONDS
