@@ -7,7 +7,6 @@ before the run. `connect` begins; the methods `hear`, `see` and `watch` may be e
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -43,7 +42,8 @@ class AnsweringWorker(Worker[A]):
         commanded: a torque has been sent, or was about to be: the simulator is this
             node's concern.
         phase: what the simulator said last of its run; empty before.
-        heard_s: monotonic time of the last joint states of this robot [s].
+        silent_looks: looks of `watch` since the last joint states of this robot. A node
+            that was stopped itself reads before it looks twice.
         foreign_states: messages on joint_states of other robots, which are ignored.
 
     """
@@ -58,7 +58,7 @@ class AnsweringWorker(Worker[A]):
         self.begun = False
         self.commanded = False
         self.phase = ""
-        self.heard_s = time.monotonic()
+        self.silent_looks = 0
         self.foreign_states = 0
         self._client: Client[Any, Any] | None = None  # of the simulator's parameters
         self._sync_reply: Any = None  # the future of its parameter `sync`
@@ -80,7 +80,7 @@ class AnsweringWorker(Worker[A]):
         own = self._own
         stamped = self.parameters.stamped
         simulator = self.parameters.simulator
-        self.heard_s = time.monotonic()
+        self.silent_looks = 0
         topic = own["commands_stamped" if stamped else "commands"]
         self._commands = topic.publisher(self.node, simulator=simulator)
         handlers = {"phase": self.hear, "joint_states": self.receive, **callbacks}
@@ -145,7 +145,7 @@ class AnsweringWorker(Worker[A]):
             raise SstError(
                 f"joint_states has no {', '.join(absent)}: its names are {names}"
             )
-        self.heard_s = time.monotonic()
+        self.silent_looks = 0
         self.see(state)
         # Once begun, the simulator may end before its last sample has arrived.
         if not (self.begun or self.may_begin()):
@@ -185,16 +185,17 @@ class AnsweringWorker(Worker[A]):
             self.done.set()
             return
         self._refuse_lockstep()
-        silent = time.monotonic() - self.heard_s
-        if silent > self.parameters.timeout:
+        silent_s = self.silent_looks * _WATCH_S
+        self.silent_looks += 1
+        if silent_s > self.parameters.timeout:
             reason = "is the simulator running?"
             if self.foreign_states:
                 joints = ", ".join(ACTUATED_JOINTS)
                 reason = f"{self.foreign_states} messages without {joints} were ignored"
             robots = topics.other_types(self.node, self._own["joint_states"])
             reasons = "; ".join([reason, *robots])
-            raise SstError(f"no joint_states for {silent:.1f} s: {reasons}")
-        if not self.commanded and silent < _WATCH_S and not self.may_begin():
+            raise SstError(f"no joint_states for {silent_s:.1f} s: {reasons}")
+        if not self.commanded and silent_s < _WATCH_S and not self.may_begin():
             self.node.get_logger().info(
                 f"waiting for subscribers: {', '.join(self.missing_subscribers())}",
                 throttle_duration_sec=_LOG_PERIOD_S,

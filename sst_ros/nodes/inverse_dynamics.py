@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import time
 from array import array
 from typing import Any, NamedTuple
 
@@ -232,7 +231,7 @@ class InverseDynamicsController(AnsweringWorker[ControllerNodeParameters]):
             return None
         finally:
             # in lockstep no message was received meanwhile
-            self.heard_s = time.monotonic()
+            self.silent_looks = 0
 
     def _is_accepted(self, outcome: concurrent.futures.Future[None]) -> bool:
         """Whether a trajectory is followed.

@@ -48,7 +48,7 @@ from sst_ros.state import BASE_FRAME, IDLE_FRAME_ID, NANOSECONDS, ZERO, State, V
 
 LOG_NS = 50_000_000
 """Torques are published once for about this time, not with each sample."""
-_HISTORY_S = 2
+_HISTORY_S = 10
 """Time of which messages are kept for slow readers."""
 _FAST = 10
 """Real-time factor that the history of a run without deadlines is made for."""
@@ -415,6 +415,6 @@ def _publish_description(
 
 
 def _history_depth(settings: SimulatorParameters) -> int:
-    """Return how many messages are kept for slow readers: two seconds of them."""
+    """Return how many messages are kept for slow readers: ten seconds of them."""
     rate = settings.publish_rate * (settings.real_time_factor or _FAST)
     return round(min(max(_HISTORY_S * rate, _LEAST_DEPTH), _MOST_DEPTH))

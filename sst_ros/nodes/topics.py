@@ -54,7 +54,7 @@ class Endpoint(NamedTuple):
     name: str
     type_name: str
     doc: str
-    depth: int = 10  # messages kept for slow readers; 0 for two seconds of them
+    depth: int = 10  # messages kept for slow readers; 0 for ten seconds of them
     latched: bool = False  # the last message is kept for late joiners
     when: str = ""  # condition under which it exists; always where empty
 

@@ -6,7 +6,6 @@ of each.
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -100,22 +99,17 @@ TOO_FAST = {
 
 
 @pytest.mark.parametrize(("scene", "torque"), TOO_FAST.values(), ids=[*TOO_FAST])
-def test_a_step_that_takes_too_much_keeps_the_last_valid_state(scene, torque):
+def test_a_step_that_takes_too_much_keeps_the_last_valid_state(scene, torque, pairs):
     """These steps took 73, 10 and 2.7 s before there was a budget."""
     simulation = Simulation(scene)
     before = simulation.state
-    for _ in range(2):  # the first one compiles
-        began = time.process_time()
-        with pytest.raises(
-            StepBudgetExceeded, match=f"{simulation.step_budget} evaluations"
-        ) as e:
-            simulation.step(torque, MILLISECOND)
-        lasted = time.process_time() - began
-        assert (
-            isinstance(e.value, Diverged)
-            and e.value.state == before == simulation.state
-        )
-    assert lasted < 0.4  # 0.12 s here, beside whatever else runs
+    with pytest.raises(
+        StepBudgetExceeded, match=f"{simulation.step_budget} evaluations"
+    ) as e:
+        simulation.step(torque, MILLISECOND)
+    assert isinstance(e.value, Diverged) and e.value.state == before == simulation.state
+    assert simulation.evaluations <= simulation.step_budget
+    assert sum(pairs.values()) < simulation.step_budget / 20  # one makes at least 20
     simulation.step(REST, MILLISECOND)  # it can go on
     assert simulation.time_ns == MILLISECOND
 

@@ -111,6 +111,12 @@ def give(worker, message):
     (worker.hear if isinstance(message, String) else worker.receive)(message)
 
 
+def look(worker, times):
+    """Look for silence as the timer does."""
+    for _ in range(times):
+        worker.watch()
+
+
 @pytest.mark.parametrize("kind", ONE_QUICK_KIND)
 def test_a_fault_ends_who_commands_in_every_order_of_messages(make, kind):
     for messages in orders(PHASES, STATES):
@@ -158,12 +164,22 @@ def test_joint_states_of_another_robot_are_no_sign_of_life(make, kind):
     assert disturbed._commands.sent == quiet._commands.sent
     assert len(quiet._commands.sent) == 3
     assert disturbed.foreign_states == 6
-    disturbed.heard_s -= 11.0
     give(disturbed, GRIPPER)
     with pytest.raises(
-        SstError, match=r"no joint_states for 11.*: 7 messages without gamma_1"
+        SstError, match=r"no joint_states for 10\.2 s: .*7 messages without gamma_1"
     ):
-        disturbed.watch()
+        look(disturbed, 42)
+
+
+@pytest.mark.parametrize("kind", [TorquePlayer, InverseDynamicsController])
+def test_silence_is_counted_in_looks_and_ends_with_a_state(make, kind):
+    """A node that is stopped for a minute looks once when it goes on, then reads."""
+    worker = make(kind)
+    for message in STATES[:3]:
+        give(worker, message)
+        look(worker, 41)
+    with pytest.raises(SstError, match=r"no joint_states for 10\.2 s"):
+        worker.watch()
 
 
 def test_the_result_of_a_goal_has_the_reason_of_the_end(make):
