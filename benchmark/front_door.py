@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from math import cos, sin
 from statistics import median
 from typing import Any, NamedTuple
 from unittest import mock
@@ -59,6 +60,11 @@ def follow_time(t: float) -> tuple[float, float, float]:
     return 0.5 * t, 0.3 - t, 0.2
 
 
+def follow_sines(t: float) -> tuple[float, float, float]:
+    """Return torques that no polynomial follows over a step."""
+    return 0.3 * sin(5.0 * t), 0.2 * cos(3.0 * t), -0.1 * sin(7.0 * t)
+
+
 def damp(t: float, state: State) -> tuple[float, float, float]:
     """Return constant torques, less some of the rates."""
     first, second, third = state.joints.gamma_dot
@@ -80,6 +86,11 @@ CALLS = (
         MuJoCo(160, 0.01, 10.0, python=True),
     ),
     Call("torque as a function of time, 1e-9 rad", HEAVY, {"torque": follow_time}),
+    Call(
+        "torque of sines of the time, 1e-6 rad",
+        HEAVY,
+        {"torque": follow_sines, "tolerance": 1e-6},
+    ),
     Call("torque as a function of the state", HEAVY, {"torque": damp}),
     Call("elastic stops, auto", "elastic_stops", {}),
     Call("friction, auto", "friction", {}),

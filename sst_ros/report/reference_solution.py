@@ -139,8 +139,8 @@ class InitialValueProblem:
 
         States have the shape (m, 7 or more).
         """
-        columns = tuple(solution.astype(float).T)
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):  # states of a solution that diverges
+            columns = tuple(solution.astype(float).T)
             joints = kernel.joints(self.dynamics.model, columns)
         return np.array([joints.gamma, joints.gamma_dot])
 

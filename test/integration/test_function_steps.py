@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sst_ros import load_scene, simulate
-from sst_ros.integration.function_steps import fit_of
+from sst_ros.integration.function_steps import TimeSteps
 from sst_ros.integration.methods import DOP853, METHODS, Tableau
 
 SCENE = load_scene("example2_heavy")
@@ -69,13 +69,17 @@ def test_samples_under_a_function_of_time_are_accurate_as_steps(method, function
     np.testing.assert_array_equal(motion.torque, [function(t) for t in motion.t])
 
 
-def test_samples_ask_a_smooth_function_for_their_torques_alone():
-    function = Counted(smooth)
+@pytest.mark.parametrize("rate", [0.5, 3.0, 30.0])
+def test_samples_ask_a_smooth_function_a_few_times_in_each_step(rate):
+    """Whatever their number; and each asks for the torque that it shows."""
+    function = Counted(
+        lambda t: (0.5 * math.sin(rate * t), 0.3 * math.cos(rate * t), 0.2)
+    )
     simulate(SCENE, function, 1.0, samples=1)
     alone = function.calls
-    motion = simulate(SCENE, function, 1.0, samples=300)
-    assert len(motion) == 301
-    assert function.calls == 2 * alone + 299
+    simulate(SCENE, function, 1.0, samples=3000)
+    inside = function.calls - 2 * alone - 2999
+    assert 0 < inside <= 1.2 * alone
 
 
 def test_equal_times_of_a_step_are_asked_for_once():
@@ -98,16 +102,51 @@ def test_samples_under_a_feedback_function_cost_less_than_steps():
     np.testing.assert_array_equal(motion.quaternion[-1], coarse.quaternion[-1])
 
 
-@pytest.mark.parametrize("method", EXPLICIT, ids=lambda method: method.name)
-def test_a_polynomial_of_torques_goes_through_them(method):
-    """Powers up to its degree are met at all stages, and at any other time."""
-    fit, rng = fit_of(method), np.random.default_rng(3)
-    size, nodes = len(fit.fitted), np.array(method.c)
-    shares = np.concatenate([nodes, 0.5 * nodes, 0.5 + 0.5 * nodes])
-    power = np.polynomial.Polynomial(rng.uniform(-1.0, 1.0, size))
-    coefficients = fit.solution @ power(shares[fit.fitted])
-    met = fit.values @ coefficients
-    np.testing.assert_allclose(met, power(shares[fit.checked]), atol=2e-14)
+def draw_function(rng):
+    """Sines, with a kink, a jump or a pulse anywhere in most of them."""
+    size, rate, phase = (
+        rng.uniform(-0.5, 0.5, 3),
+        rng.uniform(0.0, 40.0, 3),
+        rng.random(),
+    )
+    moment, length = rng.uniform(0.0, 1.0), 10.0 ** rng.uniform(-3.0, -0.5)
+    change = [
+        lambda t: 0.0,
+        lambda t: max(t - moment, 0.0),
+        lambda t: float(t >= moment),
+        lambda t: float(moment <= t < moment + length),
+    ][rng.integers(4)]
+    strength = rng.uniform(0.1, 1.0)
+
+    def function(t):
+        first, second, third = (size * np.sin(rate * t + phase)).tolist()
+        return first, second + strength * change(t), third
+
+    return function
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_torques_for_samples_are_those_of_the_function(seed, monkeypatch):
+    """In all stages of the steps to all samples."""
+    rng, compared = np.random.default_rng(seed), []
+    function = draw_function(rng)
+    compute = TimeSteps._torques_inside
+
+    def compare(self, steps, counts, x):
+        torques = compute(self, steps, counts, x)
+        begins = np.repeat([step.drive.start + step.t for step in steps], counts)
+        times = begins[:, None] + np.multiply.outer(x, self.method.c)
+        called = np.array([function(t) for t in times.ravel().tolist()])
+        np.testing.assert_allclose(torques.reshape(-1, 3), called, rtol=0.0, atol=1e-12)
+        compared.append(len(called))
+        return torques
+
+    monkeypatch.setattr(TimeSteps, "_torques_inside", compare)
+    method = rng.choice([method.name for method in EXPLICIT])
+    tolerance = 10.0 ** -rng.integers(4, 10)
+    samples = int(10.0 ** rng.uniform(0.5, 3.0))
+    simulate(SCENE, function, 1.0, samples=samples, method=method, tolerance=tolerance)
+    assert sum(compared) > samples
 
 
 def dense_error(h):
