@@ -112,6 +112,16 @@ def jump(rng: np.random.Generator) -> Case:
     return Case(_scene(rng), lambda t: first if t < at else second, None, 0.4)
 
 
+def kinks(rng: np.random.Generator) -> Case:
+    """Draw a function of time that cuts sines, of which nobody says where."""
+    sines, limit = _torques(rng, 2.0), float(rng.uniform(0.2, 1.5))
+    return Case(_scene(rng), lambda t: _cut(sines.at(t), limit), None, 0.4)
+
+
+def _cut(torques: Sequence[float], limit: float) -> list[float]:
+    return [min(max(torque, -limit), limit) for torque in torques]
+
+
 def held(rng: np.random.Generator) -> Case:
     """Draw a controller that holds torques so long that steps within have errors."""
     gain, period = float(rng.uniform(1.0, 10.0)), round(_log(rng, 0.03, 0.3), 3)
@@ -144,6 +154,16 @@ def feedback(rng: np.random.Generator) -> Case:
 def _feedback(gain: float, t: float, state: Any) -> list[float]:
     rows = zip(state.joints.gamma, state.joints.gamma_dot, strict=True)
     return [-gain * (angle - 0.8) - 0.2 * gain * rate for angle, rate in rows]
+
+
+def saturated_feedback(rng: np.random.Generator) -> Case:
+    """Draw a function of the state that cuts its torques."""
+    gain, limit = _log(rng, 1.0, 100.0), _log(rng, 0.1, 2.0)
+
+    def torque(t: float, state: Any) -> list[float]:
+        return _cut(_feedback(gain, t, state), limit)
+
+    return Case(_scene(rng), torque, None, 0.3)
 
 
 def lag(rng: np.random.Generator) -> Case:
@@ -180,9 +200,11 @@ CLASSES: dict[str, Callable[[np.random.Generator], Case]] = {
         elastic_stops,
         torque_clamp,
         jump,
+        kinks,
         held,
         held_with_memory,
         feedback,
+        saturated_feedback,
         lag,
         rotor,
     )
@@ -312,8 +334,8 @@ def summarise(rows: DataFrame) -> DataFrame:
 @styled
 def draw(rows: DataFrame, seeds: Sequence[int]) -> Figure:
     """Draw the share of runs over estimate / error: a panel a class, a curve a seed."""
-    figure = Figure(figsize=(9.0, 6.5))
-    panels = figure.subplots(2, 5, sharex=True, sharey=True)
+    figure = Figure(figsize=(9.0, 8.0))
+    panels = figure.subplots(3, 4, sharex=True, sharey=True)
     for axes, name in zip(panels.flat, CLASSES, strict=True):
         axes.axvspan(1.0, 30.0, color="0.93")
         for seed, colour, line in zip(

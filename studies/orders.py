@@ -24,6 +24,7 @@ from sst_ros.integration.methods import METHODS
 from sst_ros.integration.stepper import WHOLE_MOTION_BUDGET
 from sst_ros.mechanism.geometry import Array, angle_between
 from sst_ros.report.results import data_frame, publish, render
+from sst_ros.state import State
 from studies import DOCS, PAGES, run, run_jobs
 from studies.extreme_scenes import FREE, Changes, bouncing, changed
 from studies.sampled_data import slope
@@ -41,8 +42,13 @@ LIMIT = 1.0
 
 
 def clipped(t: float) -> list[float]:
-    """Return SINE within LIMIT, as a function whose kinks nobody knows."""
+    """Return SINE within LIMIT, as a function of the time."""
     return [max(-LIMIT, min(LIMIT, torque)) for torque in SINE.at(t)]
+
+
+def clipped_by_state(t: float, state: State) -> list[float]:
+    """Return the same, as a function that may depend on the state."""
+    return clipped(t)
 
 
 class Row(NamedTuple):
@@ -83,8 +89,10 @@ MOTIONS = {
                         duration=0.02),
     "clamp": Motion("sine cut by the torque limit: kinks are found",
                     {**FREE, "actuators.torque_limit": LIMIT}),
-    "function": Motion("the same as a function: kinks are unknown", FREE, clipped,
-                       truth="clamp"),
+    "function": Motion("the same as a function of the time: kinks are located", FREE,
+                       clipped, truth="clamp"),
+    "feedback": Motion("the same as a function of the state: kinks are unknown", FREE,
+                       clipped_by_state, truth="clamp"),
     "stop": Motion("end of the stroke", {"friction": FRICTION}, (0.9, 0.8, 0.7), 2.0),
     "contact": Motion("contact with an elastic stop", bouncing(1e4), (0.0, 0.0, 0.0),
                       0.3),
@@ -98,7 +106,7 @@ LABELS = {
 Guide = tuple[str, Callable[[Array], Array]]
 TOLERANCE: Guide = ("error = tolerance", lambda x: x)
 ROUNDING: Guide = ("1e-15 J sqrt(t / 1 s)", lambda t: 1e-15 * np.sqrt(t))
-SHOWN = ("smooth", "friction", "lag", "short lag", "clamp", "function")
+SHOWN = ("smooth", "friction", "lag", "short lag", "clamp", "function", "feedback")
 TIGHTEST = 1e-13
 STEPS = tuple(dict.fromkeys(round(2 ** (k / 2)) for k in range(21)))
 """Numbers of steps of a whole motion."""
@@ -254,7 +262,9 @@ def draw(
     down, across = -(-len(panels) // 2), min(len(panels), 2)
     figure = Figure(figsize=(9.0, 0.8 + 3.0 * down + (1.0 if across == 1 else 0.0)))
     grid = figure.subplots(down, across, squeeze=False)
-    for axes, (of, name) in zip(grid.flat, panels, strict=True):
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    for axes, (of, name) in zip(grid.flat, panels, strict=False):
         chosen = rows[(rows.of == of) & (rows.scene == name) & (rows.error < 0.05)]
         known, ends = chosen.known.max(), np.array([chosen.x.min(), chosen.x.max()])
         for method in ALL:

@@ -103,7 +103,7 @@ class Ledger:
 PARTS = {
     "invariants": ("scenes", "random scenes: invariants over 0.1 s"),
     "bits": ("scenes", "random scenes: machine code against plain Python"),
-    "estimates": ("scenes", "error estimates: ten classes of scenes, all methods"),
+    "estimates": ("scenes", "error estimates: twelve classes of scenes, all methods"),
     "workers": ("machine", "simulations in threads, forked and spawned processes"),
     "saves": ("machine", "saves to one path at a time"),
     "damage": ("machine", "files with a bit flipped, or cut"),

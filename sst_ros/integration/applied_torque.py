@@ -48,13 +48,31 @@ _PULSE = 1e-3
 """Least deviation from the neighbours, relative to the largest torque, of a pulse."""
 _SMOOTH_PULSE = 0.1
 """Least deviation, alike, of a pulse for which a step is shortened without a jump."""
+_SPIKE = 30.0
+"""Least deviation at a kink, relative to one that a quarter of all do not exceed.
+
+That of a sine is 16 times as large at the ends of a step.
+"""
+_LEAST_SPIKE = 1e-9
+"""...and relative to the largest torque: a kink that a step ends at is seen by the next
+one, as its time is rounded by `_KINK_HALVINGS`."""
+_KINK_HALVINGS = 24
+"""Times that a span with a kink is halved: 4e-9 of the step remain."""
+_KINK_SHARE = 0.125
+"""Least bend of a kink after n halvings, relative to the first bend times 2^-n.
+
+It is a half or more; that of a smooth function falls as 4^-n.
+"""
 _NOT_FINITE = (math.nan, math.nan, math.nan)
 _EXTRAPOLATION = np.array([4.0, -6.0, 4.0, -1.0])
 """Weights of four evenly spaced values in the one before them, by a cubic."""
 
 
 class Pulse(NamedTuple):
-    """Span of time in a step in which torques do not follow from their neighbours."""
+    """Span of time in a step in which torques do not follow from their neighbours.
+
+    It may be a pulse, a jump or a kink.
+    """
 
     begin: float  # time of the steps [s]
     end: float
@@ -176,22 +194,62 @@ class AppliedTorque:
         return low, high
 
     def find_pulse(self, drive: Drive, t: float, h: float) -> Pulse | None:
-        """Find where torques over time do not follow from their neighbours in a step.
+        """Find where torques over time follow least from their neighbours in a step.
 
-        The step is from t [s] of the steps on, h [s] long.
+        The step is from t [s] of the steps on, h [s] long. None where they follow.
         """
-        assert drive.function is not None
         spacing = h / CHECKED_POINTS
-        times = [drive.start + t + spacing * k for k in range(CHECKED_POINTS + 1)]
-        torques = np.array(self.at_times(drive.function, times))
+        times = [t + spacing * k for k in range(CHECKED_POINTS + 1)]
+        torques = self._rows_at(drive, times)
         deviations = np.abs(torques - _expect_torques(torques)).max(axis=1)
         k = int(deviations.argmax())
         largest = float(np.abs(torques).max())
         deviation = float(deviations[k])
-        if not deviation > _PULSE * largest:
+        usual = float(np.sort(deviations)[CHECKED_POINTS // 4])
+        is_spike = deviation > max(_SPIKE * usual, _LEAST_SPIKE * largest)
+        if not (is_spike or deviation > _PULSE * largest):
             return None
-        begin, end = t + spacing * (k - 1), t + spacing * (k + 1)
-        return Pulse(begin, end, deviation > _SMOOTH_PULSE * largest)
+        before, after = k - 1, k + 1
+        if k == 2:  # what is before the first inner point shows at the second
+            before = 0
+        if k == CHECKED_POINTS - 2:
+            after = CHECKED_POINTS
+        is_large = deviation > _SMOOTH_PULSE * largest
+        return Pulse(t + spacing * before, t + spacing * after, is_large)
+
+    def locate_kink(self, drive: Drive, begin: float, end: float) -> float | None:
+        """Locate a kink of torques over time between two times of the steps [s].
+
+        Of the halves of a span and the half in its middle, that with the largest bend
+        is kept: the bend of a kink is proportional to the span, that of a smooth
+        function to its square.
+        """
+        assert drive.function is not None
+        times = np.linspace(begin, end, 5).tolist()
+        torques = self._rows_at(drive, times)
+        first_bend = math.nan
+        for halvings in range(_KINK_HALVINGS):
+            bends = np.abs(torques[:-2] - 2.0 * torques[1:-1] + torques[2:]).max(axis=1)
+            k = int(bends.argmax())
+            bend = float(bends[k])
+            if halvings == 0:
+                first_bend = bend
+            if not bend > _KINK_SHARE * first_bend * 0.5**halvings:
+                return None
+            low, middle, high = times[k : k + 3]
+            quarters = [0.5 * (low + middle), 0.5 * (middle + high)]
+            times = [low, quarters[0], middle, quarters[1], high]
+            between = self._rows_at(drive, quarters)
+            torques = np.array(
+                [torques[k], between[0], torques[k + 1], between[1], torques[k + 2]]
+            )
+        return float(times[2])
+
+    def _rows_at(self, drive: Drive, times: Sequence[float]) -> Array:
+        """Return the torques of a drive at times of the steps [s], shape (n, 3)."""
+        assert drive.function is not None
+        times_of_run = [drive.start + time for time in times]
+        return np.array(self.at_times(drive.function, times_of_run))
 
     def rate(
         self, drive: Drive, t: float, y: Sequence[float], torque: Vector3

@@ -37,7 +37,7 @@ from sst_ros.dynamics.model import (
     transitions_of,
 )
 from sst_ros.dynamics.traced_dynamics import STATE_SIZE, Dynamics, recent_ode
-from sst_ros.integration.applied_torque import AppliedTorque
+from sst_ros.integration.applied_torque import AppliedTorque, Pulse
 from sst_ros.integration.events import (
     first_event,
     largest_overshoot,
@@ -105,6 +105,8 @@ _UNWATCHED = 1e-3
 
 No more than 0.3 ms lie between its stages.
 """
+_NEAR_THE_ENDS = 1e-6
+"""Share of a step within which a kink at one of its ends changes nothing."""
 _MOST_LOOKS = 60
 """Times that a step is made shorter for a pulse: by halves down to rounding."""
 _JUMP_MARGIN = 4e-16
@@ -302,7 +304,7 @@ class Stepper:
         drives = self._drives_of(period)
         self.budget.begin()
         t = 0.0
-        stops: list[float] = []  # times before and after a jump, at which steps end
+        stops: list[float] = []  # times at which steps end: around a jump, or at a kink
         steps = self._steps_of(drives.first, point.method)
         while t < period.h:
             step = self._take_step(t, period.h, point, drives, stops, steps)
@@ -448,7 +450,7 @@ class Stepper:
         """Take one step that is accepted, from t to `end` at most.
 
         `steps` have taken the last step. `stops` changes where a jump is found: to the
-        times just before and after it, at which steps end.
+        times just before and after it, at which steps end; or a kink: to its time.
         """
         drive, second = drives
         rejected = 0
@@ -490,7 +492,7 @@ class Stepper:
                     t, h, point, after, drive, second, steps, last, outcome.is_far,
                     outcome.stages,
                 )  # fmt: skip
-            stops[:] = self._jump_in(t, h, point.y, drive)
+            stops[:] = self._stops_in(t, h, point.y, drive)
             if stops:
                 point = point._replace(h=h)
                 continue
@@ -554,15 +556,21 @@ class Stepper:
         change = MethodChange(drive.start + t, method.name, reason)
         return point._replace(method=method, changes=(*point.changes, change))
 
-    def _jump_in(
+    def _stops_in(
         self, t: float, h: float, y: Sequence[float], drive: Drive
     ) -> list[float]:
-        """Return times just before and after a torque's jump in a step, if any."""
+        """Return times around a torque's jump in a rejected step, or that of a kink."""
         if drive.function is None:
             return []
         if h < _SHORTEST_SEARCH * max(abs(drive.start + t), h):
             return []
-        return self._stops_at_jump(t, t + h, y, drive, t, h)
+        stops = self._stops_at_jump(t, t + h, y, drive, t, h)
+        if stops:
+            return stops
+        pulse = self._pulse_in(t, h, drive)
+        if pulse is None:
+            return []
+        return self._stops_of(pulse, y, drive, t, h)
 
     def _stops_at_jump(
         self,
@@ -588,20 +596,40 @@ class Stepper:
 
         That is a pulse of a function of the time, of which its stages may have met
         nothing. Where the pulse begins or ends by a jump, `stops` changes to the times
-        around the jump.
+        around the jump; where there is a kink, to its time.
         """
-        if drive.function is None or drive.function.feedback or h <= _UNWATCHED:
-            return False
-        pulse = self.torque.find_pulse(drive, t, h)
+        pulse = self._pulse_in(t, h, drive)
         if pulse is None:
             return False
-        edges = self._stops_at_jump(pulse.begin, pulse.end, point.y, drive, t, h)
+        edges = self._stops_of(pulse, point.y, drive, t, h)
         if not edges:
             return pulse.is_large
         if edges == stops:  # steps end at this jump already
             return False
         stops[:] = edges
         return True
+
+    def _pulse_in(self, t: float, h: float, drive: Drive) -> Pulse | None:
+        """Return where a function of the time does not follow from its neighbours."""
+        if drive.function is None or drive.function.feedback or h <= _UNWATCHED:
+            return None
+        return self.torque.find_pulse(drive, t, h)
+
+    def _stops_of(
+        self, pulse: Pulse, y: Sequence[float], drive: Drive, t: float, h: float
+    ) -> list[float]:
+        """Return times around a jump in a part of a step, or that of a kink, if any.
+
+        One at an end of the step is none.
+        """
+        edges = self._stops_at_jump(pulse.begin, pulse.end, y, drive, t, h)
+        if edges:
+            return edges
+        kink = self.torque.locate_kink(drive, pulse.begin, pulse.end)
+        if kink is None:
+            return []
+        is_inside = _NEAR_THE_ENDS < (kink - t) / h < 1.0 - _NEAR_THE_ENDS
+        return [kink] if is_inside else []
 
     def _until_event(self, step: Step) -> tuple[Step, Limit | None]:
         """Return an accepted step up to its first event, and the event.

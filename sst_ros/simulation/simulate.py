@@ -141,11 +141,11 @@ def simulate(
             solution, which shows how it answers the error. Otherwise the error
             estimate, without this answer, is ten times the largest at the end of a
             period.
-        breaks: times at which a function jumps or has a kink [s], ascending. Jumps in
-            time are found without it, but a pulse may be missed that lies between two
-            of 32 even parts of a step, or changes less than 0.1 % of the largest torque
-            in the step (10 % where it has no jump). Of a function of the state only
-            pulses are found that a stage of a step meets.
+        breaks: times at which a function jumps or has a kink [s], ascending. Jumps and
+            kinks in time are found without it, but a pulse may be missed that lies
+            between two of 32 even parts of a step, or changes less than 0.1 % of the
+            largest torque in the step (10 % where it has no jump). Of a function of the
+            state only pulses are found that a stage of a step meets, and no kinks.
         max_step: longest step [s]; by default the error alone decides. With it a pulse
             of a function of the time is met if it is longer than max_step / 32 and than
             0.3 ms.

@@ -4,6 +4,7 @@
 import shutil
 
 import numpy as np
+import pyarrow
 import pyarrow.parquet as parquet
 import pytest
 
@@ -42,6 +43,16 @@ def flip_a_bit(folder):
     part(folder, 1).write_bytes(content)
 
 
+def change_a_type(folder):
+    """Write texts for numbers of texts, as a flipped bit of the schema makes it."""
+    table = parquet.read_table(part(folder, 1))
+    place = table.column_names.index("reason")
+    texts = table["reason"].cast(pyarrow.string())
+    other = table.set_column(place, "reason", texts)
+    assert other.schema.metadata == table.schema.metadata
+    parquet.write_table(other, part(folder, 1))
+
+
 def copy(folder):
     shutil.copy(part(folder, 0), part(folder, 1))
 
@@ -67,6 +78,7 @@ def add_a_second_name(folder):
     ("change", "said"),
     [
         (flip_a_bit, "part-0000001.parquet.* is damaged"),
+        (change_a_type, "part-0000001.parquet.* is damaged"),
         (copy, "part-0000001.parquet.* was written as part-0000000"),
         (swap, "part-0000000.parquet.* was written as part-0000001"),
         (add_a_stray_part, "part-0000007.parquet.* was written as part-0000000"),
