@@ -49,15 +49,12 @@ _PULSE = 1e-3
 _SMOOTH_PULSE = 0.1
 """Least deviation, alike, of a pulse for which a step is shortened without a jump."""
 _SPIKE = 30.0
-"""Least deviation at a kink, relative to one that a quarter of all do not exceed.
-
-That of a sine is 16 times as large at the ends of a step.
-"""
+"""Least deviation at a kink, relative to one that a quarter of all do not exceed."""
 _LEAST_SPIKE = 1e-9
 """...and relative to the largest torque: a kink that a step ends at is seen by the next
 one, as its time is rounded by `_KINK_HALVINGS`."""
-_KINK_HALVINGS = 24
-"""Times that a span with a kink is halved: 4e-9 of the step remain."""
+_KINK_HALVINGS = 26
+"""Times that a span with a kink is halved: 2e-9 of the step remain."""
 _KINK_SHARE = 0.125
 """Least bend of a kink after n halvings, relative to the first bend times 2^-n.
 
@@ -202,20 +199,17 @@ class AppliedTorque:
         times = [t + spacing * k for k in range(CHECKED_POINTS + 1)]
         torques = self._rows_at(drive, times)
         deviations = np.abs(torques - _expect_torques(torques)).max(axis=1)
-        k = int(deviations.argmax())
         largest = float(np.abs(torques).max())
-        deviation = float(deviations[k])
-        usual = float(np.sort(deviations)[CHECKED_POINTS // 4])
-        is_spike = deviation > max(_SPIKE * usual, _LEAST_SPIKE * largest)
+        deviation = float(deviations.max())
+        inner = deviations[2:-2]  # by neighbours on both sides
+        k = 2 + int(inner.argmax())
+        usual = float(np.sort(inner)[len(inner) // 4])
+        is_spike = deviations[k] > max(_SPIKE * usual, _LEAST_SPIKE * largest)
         if not (is_spike or deviation > _PULSE * largest):
             return None
-        before, after = k - 1, k + 1
-        if k == 2:  # what is before the first inner point shows at the second
-            before = 0
-        if k == CHECKED_POINTS - 2:
-            after = CHECKED_POINTS
-        is_large = deviation > _SMOOTH_PULSE * largest
-        return Pulse(t + spacing * before, t + spacing * after, is_large)
+        # What is halfway between two points shows at two on either side alike.
+        begin, end = t + spacing * (k - 2), t + spacing * (k + 2)
+        return Pulse(begin, end, deviation > _SMOOTH_PULSE * largest)
 
     def locate_kink(self, drive: Drive, begin: float, end: float) -> float | None:
         """Locate a kink of torques over time between two times of the steps [s].

@@ -105,7 +105,7 @@ _UNWATCHED = 1e-3
 
 No more than 0.3 ms lie between its stages.
 """
-_NEAR_THE_ENDS = 1e-6
+_NEAR_THE_ENDS = 1e-8
 """Share of a step within which a kink at one of its ends changes nothing."""
 _MOST_LOOKS = 60
 """Times that a step is made shorter for a pulse: by halves down to rounding."""
