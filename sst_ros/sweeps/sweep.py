@@ -576,7 +576,7 @@ def write_part(
     table: pa.Table, folder: Path, index: int, about: Mapping[str, Any]
 ) -> None:
     """Write the table of a chunk as a file that is there whole or not at all."""
-    record = {**about, "part": index}
+    record = {**about, "part": index, "columns": _describe_columns(table)}
     record["checksum"] = _checksum(record, table)
     table = table.replace_schema_metadata({METADATA: json.dumps(record).encode()})
     with replace_file(folder / _part_name(index)) as own:
@@ -604,10 +604,13 @@ def _checksum(about: Mapping[str, Any], table: pa.Table) -> str:
     return compute_checksum(texts, columns)
 
 
-def _reason_type() -> pa.DataType:
-    """Return the type of the column `reason`, which its checksum does not cover."""
-    pyarrow = require("pyarrow")
-    return pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
+def _describe_columns(table: pa.Table) -> list[list[str]]:
+    """Return name and type of each column: the checksum covers their bits alone."""
+    described = []
+    for name in table.column_names:
+        kind = "text" if name == "reason" else table[name].to_numpy().dtype.str
+        described.append([name, kind])
+    return described
 
 
 def _read_texts(column: pa.ChunkedArray) -> list[str]:
@@ -621,8 +624,8 @@ def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
     """Return metadata and table of a file; None where it is not whole.
 
     Raises InputError where its numbers are not those that were written, or it was
-    written under another name. Files of earlier versions have neither number nor
-    checksum.
+    written under another name. Files of earlier versions have no number, no names of
+    columns or no checksum.
     """
     with contextlib.suppress(*_unreadable()):
         table = require("pyarrow.parquet").read_table(str(path), partitioning=None)
@@ -630,9 +633,8 @@ def read_part(path: Path) -> tuple[dict[str, Any], pa.Table] | None:
         if not isinstance(about, dict):
             return None
         checksum = about.get("checksum")
-        intact = checksum is None
-        if table.schema.field("reason").type == _reason_type():
-            intact = intact or checksum == _checksum(about, table)
+        intact = checksum is None or checksum == _checksum(about, table)
+        intact = intact and about.get("columns") in (None, _describe_columns(table))
         name = _part_name(about["part"]) if "part" in about else path.name
         damaged = "is damaged (its checksum is another): delete it"
         renamed = f"was written as {name}: delete or rename it"
@@ -651,7 +653,8 @@ def _part_name(index: int) -> str:
 
 def _unreadable() -> tuple[type[Exception], ...]:
     """Return what reading a file raises that is none of a study, or is cut."""
-    return OSError, ValueError, KeyError, TypeError, require("pyarrow").ArrowException
+    arrow = require("pyarrow").ArrowException
+    return OSError, ValueError, LookupError, TypeError, arrow
 
 
 def read_about(path: Path) -> dict[str, Any] | None:
@@ -708,7 +711,11 @@ def read_sweep(folder: Path) -> pd.DataFrame:
             not_whole.append(path)
             continue
         descriptions[path], table = contents
-        tables.append(table.replace_schema_metadata(None))
+        table = table.replace_schema_metadata(None)
+        same = not tables or table.schema.equals(tables[0].schema)
+        requirement = "is damaged (its columns are others): delete it"
+        refuse_unless("sweep", ("DIR", str(path), same, requirement))
+        tables.append(table)
     if not tables:
         requirement = "must be a folder with files part-*.parquet of `sst-ros sweep`"
         raise refusal("sweep", "DIR", str(folder), requirement)
@@ -723,7 +730,9 @@ def read_sweep(folder: Path) -> pd.DataFrame:
             same = about.get(key) == first.get(key)
             refuse_unless("sweep", ("DIR", str(path), same, requirement))
     attributes = {
-        key: value for key, value in first.items() if key not in ("part", "checksum")
+        key: value
+        for key, value in first.items()
+        if key not in ("part", "columns", "checksum")
     }
     return to_frame(require("pyarrow").concat_tables(tables), attributes)
 

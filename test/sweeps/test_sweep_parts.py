@@ -53,6 +53,14 @@ def change_a_type(folder):
     parquet.write_table(other, part(folder, 1))
 
 
+def change_a_name(folder):
+    """Rename a column, as a flipped bit of the schema does."""
+    table = parquet.read_table(part(folder, 1))
+    names = [name.replace("energy", "enepgy") for name in table.column_names]
+    other = table.rename_columns(names).replace_schema_metadata(table.schema.metadata)
+    parquet.write_table(other, part(folder, 1))
+
+
 def copy(folder):
     shutil.copy(part(folder, 0), part(folder, 1))
 
@@ -78,6 +86,7 @@ def add_a_second_name(folder):
     ("change", "said"),
     [
         (flip_a_bit, "part-0000001.parquet.* is damaged"),
+        (change_a_name, "part-0000001.parquet.* is damaged"),
         (change_a_type, "part-0000001.parquet.* is damaged"),
         (copy, "part-0000001.parquet.* was written as part-0000000"),
         (swap, "part-0000000.parquet.* was written as part-0000001"),
