@@ -105,7 +105,7 @@ _UNWATCHED = 1e-3
 
 No more than 0.3 ms lie between its stages.
 """
-_NEAR_THE_ENDS = 1e-8
+_NEAR_THE_ENDS = 1e-12
 """Share of a step within which a kink at one of its ends changes nothing."""
 _MOST_LOOKS = 60
 """Times that a step is made shorter for a pulse: by halves down to rounding."""
@@ -628,7 +628,8 @@ class Stepper:
         kink = self.torque.locate_kink(drive, pulse.begin, pulse.end)
         if kink is None:
             return []
-        is_inside = _NEAR_THE_ENDS < (kink - t) / h < 1.0 - _NEAR_THE_ENDS
+        margin = max(_NEAR_THE_ENDS * h, _JUMP_MARGIN * abs(drive.start + kink))
+        is_inside = t + margin < kink < t + h - margin
         return [kink] if is_inside else []
 
     def _until_event(self, step: Step) -> tuple[Step, Limit | None]:

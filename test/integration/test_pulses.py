@@ -118,5 +118,5 @@ def test_a_kink_is_located_and_a_smooth_function_has_none(seed):
     torque = AppliedTorque(Dynamics.of(SCENE), None)
     bent_drive = Drive((0.0, 0.0, 0.0), FunctionTorque(bent))
     smooth_drive = Drive((0.0, 0.0, 0.0), FunctionTorque(smooth))
-    assert torque.locate_kink(bent_drive, 0.0, span) == pytest.approx(kink, abs=1e-9)
+    assert torque.locate_kink(bent_drive, 0.0, span) == pytest.approx(kink, abs=1e-11)
     assert torque.locate_kink(smooth_drive, 0.0, span) is None
