@@ -61,7 +61,7 @@ def follow_time(t: float) -> tuple[float, float, float]:
 
 
 def follow_sines(t: float) -> tuple[float, float, float]:
-    """Return torques that no polynomial follows over a step."""
+    """Return sines of the time."""
     return 0.3 * sin(5.0 * t), 0.2 * cos(3.0 * t), -0.1 * sin(7.0 * t)
 
 

@@ -267,7 +267,7 @@ def draw(
     grid = figure.subplots(down, across, squeeze=False)
     for axes in grid.flat[len(panels) :]:
         axes.set_axis_off()
-    for axes, (of, name) in zip(grid.flat, panels, strict=False):
+    for axes, (of, name) in zip(grid.flat[: len(panels)], panels, strict=True):
         chosen = rows[(rows.of == of) & (rows.scene == name) & (rows.error < 0.05)]
         known, ends = chosen.known.max(), np.array([chosen.x.min(), chosen.x.max()])
         for method in ALL:

@@ -160,6 +160,13 @@ class AppliedTorque:
         assert drive.function is not None
         return self.at(drive.function, drive.start + t, y)
 
+    def of_drive_at_times(
+        self, drive: Drive, times: Sequence[float]
+    ) -> Sequence[Vector3]:
+        """Return the torques of a drive without feedback at times of the steps [s]."""
+        assert drive.function is not None
+        return self.at_times(drive.function, [drive.start + time for time in times])
+
     def locate_jump(
         self, drive: Drive, begin: float, end: float, y: Sequence[float]
     ) -> tuple[float, float] | None:
@@ -201,7 +208,7 @@ class AppliedTorque:
         """
         spacing = h / CHECKED_POINTS
         times = [t + spacing * k for k in range(CHECKED_POINTS + 1)]
-        torques = self._rows_at(drive, times)
+        torques = np.array(self.of_drive_at_times(drive, times))
         deviations = np.abs(torques - _expect_torques(torques)).max(axis=1)
         largest = float(np.abs(torques).max())
         deviation = float(deviations.max())
@@ -222,9 +229,8 @@ class AppliedTorque:
         is kept: the bend of a kink is proportional to the span, that of a smooth
         function to its square.
         """
-        assert drive.function is not None
         times = np.linspace(begin, end, 5).tolist()
-        torques = self._rows_at(drive, times)
+        torques = np.array(self.of_drive_at_times(drive, times))
         first_bend = math.nan
         for halvings in range(_KINK_HALVINGS):
             bends = np.abs(torques[:-2] - 2.0 * torques[1:-1] + torques[2:]).max(axis=1)
@@ -237,17 +243,11 @@ class AppliedTorque:
             low, middle, high = times[k : k + 3]
             quarters = [0.5 * (low + middle), 0.5 * (middle + high)]
             times = [low, quarters[0], middle, quarters[1], high]
-            between = self._rows_at(drive, quarters)
+            between = self.of_drive_at_times(drive, quarters)
             torques = np.array(
                 [torques[k], between[0], torques[k + 1], between[1], torques[k + 2]]
             )
         return float(times[2])
-
-    def _rows_at(self, drive: Drive, times: Sequence[float]) -> Array:
-        """Return the torques of a drive at times of the steps [s], shape (n, 3)."""
-        assert drive.function is not None
-        times_of_run = [drive.start + time for time in times]
-        return np.array(self.at_times(drive.function, times_of_run))
 
     def rate(
         self, drive: Drive, t: float, y: Sequence[float], torque: Vector3

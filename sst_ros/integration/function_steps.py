@@ -302,10 +302,8 @@ class TimeSteps(FunctionSteps):
 
         The function is called once for times that are equal.
         """
-        assert drive.function is not None
         distinct_times = list(dict.fromkeys(times))
-        times_of_run = [drive.start + time for time in distinct_times]
-        torques = self._torque.at_times(drive.function, times_of_run)
+        torques = self._torque.of_drive_at_times(drive, distinct_times)
         torque_by_time = dict(zip(distinct_times, torques, strict=True))
         return [torque_by_time[time] for time in times]
 
@@ -360,10 +358,8 @@ class TimeSteps(FunctionSteps):
         """
         called = []
         for step in steps:
-            drive = step.drive
-            assert drive.function is not None
-            times = drive.start + step.t + step.h * _SHARES
-            called.append(self._torque.at_times(drive.function, times.tolist()))
+            times = (step.t + step.h * _SHARES).tolist()
+            called.append(self._torque.of_drive_at_times(step.drive, times))
         torques = np.array(called)
         coefficients = _FIT @ torques
         largest = np.abs(torques).max(axis=(1, 2))
